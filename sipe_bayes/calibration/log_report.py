@@ -10,7 +10,7 @@ import numpy as np
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_tables import LogEntry, Measurement
 from sipe_bayes.calibration.grid import Grid, Recording, Series, gaps
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
@@ -30,6 +30,7 @@ class Saturation(Options):
 
 
 _SATURATION = Saturation()
+_EVEN = 0.95  # share of the samples of a slower sensor that are as far apart as usual
 _SILENT = 10.0  # periods of a command after its last one: a stream that has stopped, and no late message
 
 
@@ -51,7 +52,8 @@ def report_of(
     # a quaternion has length one: where a body rests or lies squarely, a component is at its largest
     signals = {name: y.values for name, (m, _), y in measured if not m.quaternion}
     signals |= {c.target: y.values for c, y in zip(config.drives, raw.commands, strict=True)}
-    missing = {name: int((~finite[:, j]).sum()) for j, name in enumerate(config.channels)}
+    every = {name: _every(finite[:, j]) for j, name in enumerate(config.channels)}
+    missing = {name: int((~finite[:, j]).sum()) if every[name] == 1 else 0 for j, name in enumerate(config.channels)}
     driven = {command.target for command in config.drives}
     clipped = {name: count_clipped(values, name in driven) for name, values in signals.items()}
     saturated = {name: n for name, n in clipped.items() if n > _SATURATION.share * len(raw.time)}
@@ -85,6 +87,11 @@ def report_of(
             *_of_clocks(config, log, raw),
             *(note(Code.LOG_WILD, channel=m.name, count=n) for m, n in wild if n),
             *(note(Code.LOG_GAP, start=start, stop=stop) for start, stop in holes),
+            *(
+                note(Code.LOG_RATE, channel=c, rate=f"{1 / (n * grid.dt):.4g} Hz", every=n)
+                for c, n in every.items()
+                if n > 1
+            ),
             *(note(Code.LOG_MISSING, channel=c, missing=n, samples=grid.samples) for c, n in missing.items() if n),
             *(note(Code.LOG_BLANK_COMMANDS, channel=c, blank=n) for c, n in blank.items() if n),
             *(note(Code.LOG_CLIPPED, channel=c, clipped=n) for c, n in saturated.items()),
@@ -116,6 +123,13 @@ def _of_clocks(config: Config, log: LogEntry, raw: Recording) -> list[Finding]:
         rate = f"{min(slow.values()):.3g} Hz"
         noticed.append(finding(Code.LOG_SLOW, log=log.name, channels=", ".join(slow), rate=rate))
     return noticed
+
+
+def _every(known: BoolArray) -> int:
+    """By how many samples those that are there (n,) are apart, where nearly all are as far; else 1."""
+    apart = np.diff(np.flatnonzero(known))
+    usual = int(np.median(apart)) if len(apart) else 1
+    return usual if np.mean(apart == usual) > _EVEN else 1
 
 
 def _of_joint(measurement: Measurement) -> bool:

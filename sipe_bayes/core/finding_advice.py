@@ -198,6 +198,7 @@ ADVICE: dict[Code, str] = {
     Code.LOG_CLOCK: "Nothing to do.",
     Code.LOG_RESAMPLED: "Nothing to do, unless the jitter is as large as the delays that you look for.",
     Code.LOG_GAP: "Nothing to do where it is short. Cut the log there by `span` if the command did change in the gap.",
+    Code.LOG_RATE: "Nothing to do.",
     Code.LOG_MISSING: "Nothing to do: masked samples are not fitted.",
     Code.LOG_BLANK_COMMANDS: "See that a blank means 'as before' in your log and not 'off'.",
     Code.LOG_CLOCKS: "See that all clocks count from the same instant: an offset between them looks like a delay.",

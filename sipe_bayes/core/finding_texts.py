@@ -317,6 +317,7 @@ class Code(Enum):
     LOG_CLOCK = note("{samples} samples passed through unchanged at {rate}; clock jitter {jitter_ms:.3g} ms")
     LOG_RESAMPLED = note("{samples} samples at {own_rate}, clock jitter {jitter_ms:.3g} ms, resampled to {rate}")
     LOG_GAP = note("no measurement from {start:.3f} to {stop:.3f} s; commands are held there")
+    LOG_RATE = note("{channel} comes at {rate}, in one of {every} samples; between them it is not fitted")
     LOG_MISSING = note("{channel}: {missing} of {samples} samples missing, masked")
     LOG_BLANK_COMMANDS = note("{channel}: {blank} blank commands, the one before is held")
     LOG_CLOCKS = note(

@@ -278,3 +278,16 @@ def test_shipped_logs_pass_through(name: str) -> None:
         np.testing.assert_array_equal(trajectory.observations[:, 0], np.float64(table[config.measurements[0].column]))
         assert not report.resampled
         assert len(report.notes) == 1, report.notes
+
+
+def test_a_sensor_that_is_slower_than_the_log_misses_nothing(tmp_path: Path) -> None:
+    t = np.arange(200) / 200
+    q = np.where(np.arange(200) % 4 == 1, np.sin(9 * t), np.nan)
+    _, report = load(tmp_path, {"t": t, "q": q, "u": t})
+    print(report.notes)
+    assert any("q comes at 50 Hz, in one of 4 samples" in note for note in report.notes)
+    assert not report.suspect
+    q[np.random.default_rng(0).random(200) < 0.3] = np.nan
+    _, report = load(tmp_path, {"t": t, "q": q, "u": t})
+    assert report.missing["q"] == np.isnan(q).sum()
+    assert report.suspect
