@@ -346,7 +346,7 @@ def _unknowns(
         for reading, channels in zip(draft.measurements, layout.channels, strict=False)
         for k in channels if k in lost
     ]  # fmt: skip
-    return [*late, *shown], samples, [*notes, *sprung(unknowns, beside, left)], doubts
+    return [*late, *shown], samples, notes, [*doubts, *sprung(unknowns, beside, left)]
 
 
 def _some(unknowns: list[Unknown]) -> tuple[list[Unknown], list[str]]:

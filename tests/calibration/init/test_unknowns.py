@@ -7,7 +7,7 @@ import pytest
 
 from sipe_bayes.calibration.init.draft import Unknown
 from sipe_bayes.calibration.init.fits import Fit
-from sipe_bayes.calibration.init.unknowns import delay_of, told_apart
+from sipe_bayes.calibration.init.unknowns import delay_of, sprung, told_apart
 
 
 @pytest.mark.parametrize(
@@ -56,3 +56,14 @@ def test_a_delay_that_explains_little_is_called_uncertain(times: float, clear: b
     assert delay.note == note
     assert ("uncertain, for it explains 3 % of what simulations miss" in note) is not clear
     assert note.startswith("commands arrive about 40 ms late" if clear else "commands may arrive about 40 ms late")
+
+
+@pytest.mark.parametrize(("size", "theta", "shown"), [(600.0, 0.5, True), (600.0, 0.01, False), (5.0, 0.5, False)])
+def test_a_spring_is_told_where_one_shows(size: float, theta: float, shown: bool) -> None:
+    """Of 4 N m/rad at most: with what it is about, its target, and its bounds."""
+    basis = np.linalg.qr(np.random.default_rng(0).standard_normal((400, 2)))[0]
+    fit = Fit((0,), np.ones(1), np.array([0.5, theta]), basis * [500.0, size], np.ones(1))
+    mass, spring = Unknown("mass", (), 0.0, 1.0, False, ""), Unknown("s", ("joint:j.stiffness",), 0.0, 4.0, False, "")
+    lines = sprung([mass], [spring], fit)
+    assert bool(lines) is shown
+    assert all("of about 2 in SI" in line and "'joint:j.stiffness' a parameter, [0, 4]" in line for line in lines)
