@@ -348,8 +348,8 @@ def sprung(unknowns: Sequence[Unknown], beside: Sequence[Unknown], fit: Fit) -> 
         if float(np.linalg.norm(shown)) > _CLEAR and fit.theta[k] > _NOTABLE:
             value, target = spring.low + fit.theta[k] * (spring.high - spring.low), spring.targets[0]
             out.append(
-                f"a spring of about {value:.2g} in SI seems to act where the model has none: make {target!r} a parameter, "
-                f"[{spring.low:g}, {spring.high:.2g}], and its springref"
+                f"a spring of about {value:.2g} in SI seems to act where the model has none: make {target!r} a "
+                f"parameter, [{spring.low:g}, {spring.high:.2g}], and its springref"
             )
     return out
 
