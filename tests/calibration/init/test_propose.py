@@ -66,9 +66,8 @@ def test_a_spring_that_the_model_lacks_hides_no_delay(kind: str, variant: int, s
     truth = make_log(tmp_path, KINDS[kind], variant, 100 + variant, spring)
     draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
     assert round(draft.delay) == truth.delay > 1
-    assert [f"joint:{KINDS[kind].joints[0]}" in note for note in draft.notes if "a spring" in note] == [True] * (
-        spring > 0
-    )
+    lines = [doubt for doubt in draft.doubts if "a spring" in doubt]
+    assert [f"joint:{KINDS[kind].joints[0]}" in line for line in lines] == [True] * (spring > 0)
 
 
 def test_samples_that_are_missing_hide_nothing(tmp_path: Path) -> None:
