@@ -30,7 +30,7 @@ class Saturation(Options):
 
 
 _SATURATION = Saturation()
-_EVEN = 0.95  # share of the samples of a slower sensor that are as far apart as usual
+_EVEN, _FEWEST = 0.95, 10  # share of a slower sensor's samples that are as far apart as usual; and how many it has
 _SILENT = 10.0  # periods of a command after its last one: a stream that has stopped, and no late message
 
 
@@ -53,7 +53,8 @@ def report_of(
     signals = {name: y.values for name, (m, _), y in measured if not m.quaternion}
     signals |= {c.target: y.values for c, y in zip(config.drives, raw.commands, strict=True)}
     every = {name: _every(finite[:, j]) for j, name in enumerate(config.channels)}
-    missing = {name: int((~finite[:, j]).sum()) if every[name] == 1 else 0 for j, name in enumerate(config.channels)}
+    expected = {name: len(finite) // n for name, n in every.items()}
+    missing = {name: max(expected[name] - int(finite[:, j].sum()), 0) for j, name in enumerate(config.channels)}
     driven = {command.target for command in config.drives}
     clipped = {name: count_clipped(values, name in driven) for name, values in signals.items()}
     saturated = {name: n for name, n in clipped.items() if n > _SATURATION.share * len(raw.time)}
@@ -126,9 +127,11 @@ def _of_clocks(config: Config, log: LogEntry, raw: Recording) -> list[Finding]:
 
 
 def _every(known: BoolArray) -> int:
-    """By how many samples those that are there (n,) are apart, where nearly all are as far; else 1."""
+    """By how many samples those that are there (n,) are apart, where they are many and nearly all as far; else 1."""
     apart = np.diff(np.flatnonzero(known))
-    usual = int(np.median(apart)) if len(apart) else 1
+    if len(apart) < _FEWEST:
+        return 1
+    usual = int(np.median(apart))
     return usual if np.mean(apart == usual) > _EVEN else 1
 
 

@@ -287,6 +287,9 @@ def test_a_sensor_that_is_slower_than_the_log_misses_nothing(tmp_path: Path) -> 
     print(report.notes)
     assert any("q comes at 50 Hz, in one of 4 samples" in note for note in report.notes)
     assert not report.suspect
+    _, report = load(tmp_path, {"t": t, "q": np.where(t < 0.5, q, np.nan), "u": t})
+    assert report.missing["q"] == 25, "a sensor that falls silent half-way"
+    assert report.suspect
     q[np.random.default_rng(0).random(200) < 0.3] = np.nan
     _, report = load(tmp_path, {"t": t, "q": q, "u": t})
     assert report.missing["q"] == np.isnan(q).sum()

@@ -1,7 +1,7 @@
 """Columns of what drives apply at their joints, such as the efforts of servos: their signs and units.
 
 With a force a machine's masses, friction and gains are known in SI; without any they are known relative to each other.
-No simulation is needed for it: commands, positions and velocities of one instant make the force of the model.
+A motion need not be followed for it: commands, positions and velocities of one instant make the force of the model.
 """
 
 from __future__ import annotations
