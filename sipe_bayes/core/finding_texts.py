@@ -295,13 +295,13 @@ class Code(Enum):
     )
     OUTSIDE_PRIOR_UNKNOWN = caution("whether the logs lie within the prior is unknown: {reason}")
     LOGS_DISAGREE = blocking(
-        "the logs disagree about {parameters} (p = {p:.1g}): {estimates} {unit}; give it per_log = true, model what "
-        "changed, or leave a log out{without}",
+        "the logs disagree about {parameters} (p = {p:.1g}): the others being common, {estimates}; "
+        "give it per_log = true, model what changed, or leave a log out{without}",
         "disagrees between logs",
     )
     LOGS_DISAGREE_UNEXPLAINED = blocking(
         "the logs disagree (p = {p:.1g}) and no single parameter explains it: the model lacks something that differs "
-        "between them; {parameters} explains most ({estimates} {unit}){without}",
+        "between them; {most}{without}",
         "disagrees between logs",
     )
     AGREEMENT_UNKNOWN = caution("log {log} could not be fitted by itself; whether it agrees is unknown")

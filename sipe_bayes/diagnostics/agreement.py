@@ -7,12 +7,14 @@ itself, less those that they determine together (Cochran's test). Along directio
 keeps within the cube, which makes Q smaller than that at most.
 
 The parameter named is the one whose freedom to differ between logs lowers Q most: the most economical explanation, not
-merely the largest shift. Where even that leaves the logs in disagreement, the text says that no single parameter
-explains it. And each log is left out in turn: where the others agree without one, that one is named.
+merely the largest shift. Where even that leaves the logs in disagreement, no single parameter explains it: named is the
+one whose values differ most between the logs, each by itself, or none where only combinations differ. And each log is
+left out in turn: where the others agree without one, that one is named.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -40,6 +42,7 @@ from sipe_bayes.simulation.simulator import Simulator
 
 LOG_BUDGET = 5000  # rollouts for each log
 _PIECES = 5  # of a single log, where there is no other to compare it with
+_DETERMINED = (1 - THRESHOLDS.not_determined) / math.sqrt(12)  # sd of a log that tells a parameter: of the prior's
 _FLAT = 1e-6  # precision that keeps a log's information invertible where it leaves a direction open
 
 
@@ -49,10 +52,11 @@ class Disagreement:
 
     Args:
         p: of Cochran's Q under agreement.
-        parameter: its most economical explanation.
-        p_left: the same with that parameter free in every log.
-        per_log: (log, value, sd) in the parameter's unit, of logs that determine it; on a logarithmic scale half of
-            what lies between the values a sd in theta below and above.
+        parameter: its most economical explanation; where that does not explain it, the one that differs most.
+        p_left: the p that is left with the most economical one free in every log.
+        per_log: (log, value, sd) in the parameter's unit, of logs that determine it, the other parameters being common
+            where it explains the disagreement; on a logarithmic scale half of what lies between the values a sd in
+            theta below and above. None where only combinations differ.
         unit: of the parameter.
         odd: the log without which the others agree best, where they do at the same level.
         p_without: how well they agree without it.
@@ -70,12 +74,15 @@ class Disagreement:
     def finding(self) -> Finding:
         """It as a finding about the parameter."""
         unexplained = self.p_left < THRESHOLDS.logs_disagree
+        says = ", ".join(f"{log} says {value:.4g} ± {sd:.2g}" for log, value, sd in self.per_log)
+        estimates = f"{says} {self.unit}".rstrip()
+        most = f"{self.parameter} differs most ({estimates})" if says else "only combinations of parameters differ"
         return finding(
             Code.LOGS_DISAGREE_UNEXPLAINED if unexplained else Code.LOGS_DISAGREE,
             parameters=[self.parameter],
             p=self.p,
-            estimates=", ".join(f"{log} says {value:.4g} ± {sd:.2g}" for log, value, sd in self.per_log),
-            unit=self.unit,
+            estimates=estimates,
+            most=most,
             without="" if self.odd is None else f"; without {self.odd} the others agree (p = {self.p_without:.1g})",
         )
 
@@ -204,10 +211,13 @@ def disagreement(space: ParameterSpace, logs: Sequence[LogEstimate]) -> Disagree
     if together.freedom < 1 or together.p > THRESHOLDS.logs_disagree:
         return None
     apart = [_scatter(roots, sought, own=j) for j in range(len(shared))]
-    worst = int(np.argmin([scatter.q for scatter in apart]))
-    parameter, per_log = space[shared[worst]], []
-    for log, theta, sd in zip(logs, *apart[worst].own, strict=True):
-        if sd < (1 - THRESHOLDS.not_determined) / np.sqrt(12):  # of the uniform prior's
+    named = int(np.argmin([scatter.q for scatter in apart]))
+    p_left, own = apart[named].p, apart[named].own
+    if p_left < THRESHOLDS.logs_disagree:
+        named, own = _by_themselves(logs, shared)
+    parameter, per_log = space[shared[named]], []
+    for log, theta, sd, known in zip(logs, *own, strict=True):
+        if known < _DETERMINED:
             within = float(np.clip(theta, -1.0, 2.0)) if parameter.scale == "log" else float(theta)  # else 1e99
             value, low, high = (float(parameter.value(x)) for x in (within, within - sd, within + sd))
             per_log.append((log.name, value, (high - low) / 2))  # perhaps beyond a bound
@@ -215,7 +225,24 @@ def disagreement(space: ParameterSpace, logs: Sequence[LogEstimate]) -> Disagree
     best = max(range(len(logs)), key=lambda k: left_out[k].p if left_out[k].freedom else -1.0)
     agree = left_out[best].freedom > 0 and left_out[best].p > THRESHOLDS.logs_disagree
     odd = (logs[best].name, left_out[best].p) if agree else (None, 0.0)
-    return Disagreement(together.p, parameter.name, apart[worst].p, tuple(per_log), parameter.unit, *odd)
+    return Disagreement(together.p, parameter.name, p_left, tuple(per_log), parameter.unit, *odd)
+
+
+def _by_themselves(logs: Sequence[LogEstimate], shared: Sequence[int]) -> tuple[int, _Own]:
+    """Which of the shared parameters differs most between logs each by itself, and what each says of it.
+
+    None is known where none differs by more than such values do.
+    """
+    means = np.stack([log.mean[shared] for log in logs])
+    belief = UNIFORM_PRECISION * np.eye(len(shared))
+    covariances = [np.linalg.inv(marginal(log.information, shared) + belief) for log in logs]
+    sds = np.sqrt([np.diag(covariance) for covariance in covariances])
+    weight = np.where(sds < _DETERMINED, 1 / sds**2, 0.0)
+    middle = (weight * means).sum(0) / np.maximum(weight.sum(0), 1e-300)
+    p = scipy.stats.chi2.sf((weight * (means - middle) ** 2).sum(0), np.maximum((weight > 0).sum(0) - 1, 1))
+    most = int(np.argmin(p))
+    differs = p[most] * len(shared) < THRESHOLDS.logs_disagree
+    return most, (means[:, most], sds[:, most], sds[:, most] if differs else np.full(len(logs), np.inf))
 
 
 def marginal(information: FloatArray, kept: Sequence[int]) -> FloatArray:
@@ -236,13 +263,18 @@ def _root(information: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(eigenvalues[determined])[:, None] * axes[:, determined].T)
 
 
+_Own = tuple[FloatArray, FloatArray, FloatArray]
+"""Of a parameter that each log has by itself: estimates (K,), sds (K,) where the others are what they are, and sds (K,)
+without knowing these."""
+
+
 @dataclass(frozen=True)
 class _Scatter:
-    """Q, its degrees of freedom, and estimates (K,) and sds (K,) of what each log has by itself."""
+    """Q, its degrees of freedom, and what each log has by itself."""
 
     q: float
     freedom: int
-    own: tuple[FloatArray, FloatArray]
+    own: _Own
 
     @property
     def p(self) -> float:
@@ -263,4 +295,5 @@ def _scatter(roots: list[FloatArray], sought: list[FloatArray], own: int | None 
     solution = axes @ scipy.optimize.lsq_linear(rows @ axes, target, (low, high), tol=1e-12).x
     sd = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows + UNIFORM_PRECISION * np.eye(rows.shape[1]))))
     q = float(((rows @ solution - target) ** 2).sum())
-    return _Scatter(q, len(rows) - int((~weak).sum()), (solution[len(common) :], sd[len(common) :]))
+    alone = 1 / np.sqrt((rows[:, len(common) :] ** 2).sum(0) + UNIFORM_PRECISION)
+    return _Scatter(q, len(rows) - int((~weak).sum()), (solution[len(common) :], alone, sd[len(common) :]))

@@ -152,14 +152,15 @@ def headline(
         parameters: all of them.
         findings: about them.
         bands: what those of the held-out logs hold.
-        brief: without the doubts, where they stand beside it.
+        brief: the first of the doubts, without its remedy, where all of them stand beside it.
     """
     wanted = [p for p in parameters if not p.nuisance]
     if not wanted:
         return Verdict("fair", "Only nuisance parameters were estimated.")
     doubts = _doubts(findings, wanted)
     if doubts and brief:
-        return Verdict("bad", "No value may be trusted within its interval yet; the warnings say why.")
+        others = f" (and {len(doubts) - 1} more, among the warnings)" if len(doubts) > 1 else ""
+        return Verdict("bad", f"No value may be trusted within its interval yet: {doubts[0].split(': ')[0]}{others}.")
     if doubts:
         others = f"; and {len(doubts) - _DOUBTS} more, among the warnings" if len(doubts) > _DOUBTS else ""
         first = "; ".join(doubts[:_DOUBTS])
@@ -237,7 +238,20 @@ def lack(calibration: Calibration) -> Verdict | None:
     share = f"{100 * misfit.share[channel]:.2g} % of the residual of {channel}"
     if not misfit.matters:
         return Verdict("fair", f"The model lacks something small: it looks like {misfit.cause} ({share}).")
-    return Verdict("bad", f"The model lacks something: it looks like {misfit.cause} ({share}, {misfit.p_text}).")
+    text = f"The model lacks something: it looks like {misfit.cause} ({share}, {misfit.p_text})"
+    moved = sorted(misfit.moved, key=lambda name: -abs(misfit.shift[name]))[:_DOUBTS]
+    if moved:
+        text += f"; with it {listed([_would_be(calibration, name, misfit.shift[name]) for name in moved])}"
+    return Verdict("bad", f"{text}. `sipe discover` tries it." if misfit.shift else f"{text}.")
+
+
+def _would_be(calibration: Calibration, name: str, sds: float) -> str:
+    """Where a parameter would be that moves by so many sds, and where it is."""
+    posterior = calibration.posterior
+    j = posterior.space.names.index(name)
+    theta, sd, value = float(posterior.mode[j]), float(posterior.stddev[j]), posterior.space[j].value
+    there = float(value(min(max(theta + sds * sd, 0.0), 1.0)))
+    return f"{name} would be about {number(there, 2)}, not {number(float(value(theta)), 2)}"
 
 
 def mixing_verdict(calibration: Calibration) -> Verdict | None:

@@ -184,3 +184,34 @@ def test_how_uncertain_a_log_is_beyond_a_bound_of_a_logarithmic_scale(beyond: fl
     assert name == "b"
     assert value == pytest.approx(parameter.value(float(np.clip(beyond, -1, 2))), rel=0.03)
     assert sd == pytest.approx((high - low) / 2, rel=0.05)  # the information has the uniform prior's beside it
+
+
+def test_the_numbers_of_a_disagreement_differ_by_more_than_their_sds() -> None:
+    """Two logs that know a combination of a and b well, neither alone: named is a, its sds with b in common."""
+    space, information = ParameterSpace([Parameter("a"), Parameter("b")]), TURNED @ np.diag([1e8, 60.0]) @ TURNED.T
+    logs = [LogEstimate(str(k), np.array([0.5, 0.5]) + 3e-3 * k * TURNED[:, 0], information) for k in range(2)]
+    noticed = disagreement(space, logs)
+    assert noticed is not None
+    (_, one, sd), (_, other, _) = noticed.per_log
+    assert abs(one - other) > 5 * sd
+
+
+def test_no_number_is_shown_where_only_combinations_differ() -> None:
+    """Logs that know two combinations well, differing in one: no parameter explains it, none differs; else the most."""
+    space, logs = ParameterSpace([Parameter("a"), Parameter("b"), Parameter("c")]), []
+    known = np.array([[1.0, -1.0, 0.0], [1.0, 1.0, -1.0]])
+    for k in range(5):
+        information = 60 * np.eye(3) + 1e8 * known.T @ known
+        logs.append(
+            LogEstimate(
+                str(k), 0.5 + 0.005 * np.array([[1, 0], [0, 1], [-1, 1], [1, -1], [-1, -1]][k]) @ known, information
+            )
+        )
+    noticed = disagreement(space, logs)
+    assert noticed is not None
+    assert "only combinations of parameters differ" in noticed.text
+    apart = [LogEstimate(str(k), np.array([0.5 + 0.2 * k, 0.5 - 0.1 * k, 0.5]), 1e4 * np.eye(3)) for k in range(3)]
+    noticed = disagreement(space, apart)
+    assert noticed is not None
+    assert noticed.text.count("says") == 3
+    assert "a differs most" in noticed.text

@@ -168,6 +168,19 @@ def test_what_the_model_lacks_is_among_the_first_sentences(calibration: Calibrat
     assert strange.to_dict()["misfit"]["matters"]
 
 
+def test_what_the_model_lacks_says_where_values_would_be(calibration: Calibration) -> None:
+    """P1 is at 0.35 of [1, 2], sd 0.03; what moves by less than a sd is not named, nor where nothing can be told."""
+    lacks = judged.lack(dataclasses.replace(calibration, misfit=LACKS))
+    assert lacks is not None
+    assert lacks.text.endswith("with it p1 would be about 1.4, not 1.3. `sipe discover` tries it.")
+    far = judged.lack(dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, shift={"p1": 1e3, "p2": -2})))
+    assert far is not None
+    assert "p1 would be about 2, not 1.3 and p2 would be about 1.6, not 1.7" in far.text
+    coloured = judged.lack(dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, shift={})))
+    assert coloured is not None
+    assert "would" not in coloured.text
+
+
 def test_headline_counts_without_nuisance_parameters() -> None:
     good, weak, nuisance = parameter(0.9), parameter(0.5), parameter(0.9, nuisance=True)
 
@@ -185,6 +198,11 @@ def test_headline_counts_without_nuisance_parameters() -> None:
         words = "the chains have not mixed; another; and 1 more, among the warnings"
         expected = judged.Verdict("bad", f"No value may be trusted within its interval yet: {words}.")
         assert judged.headline(values, doubts) == expected
+    spent = Findings([doubt("the budget ran out: give more", Code.BUDGET_SPENT), doubt("another")])
+    brief = judged.headline([good], spent, brief=True).text
+    assert brief == "No value may be trusted within its interval yet: another (and 1 more, among the warnings)."
+    brief = judged.headline([good], Findings(list(spent)[:1]), brief=True).text
+    assert brief == "No value may be trusted within its interval yet: the budget ran out."
     assert judged.parameter_verdict(good, Findings()).tone == "good"
     assert judged.parameter_verdict(good, doubts).tone == "fair"
 
