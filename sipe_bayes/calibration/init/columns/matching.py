@@ -31,11 +31,14 @@ def match_columns(machine: Machine, table: Table) -> Matches:
     labels = [label for label in labels if label.kind not in (Kind.TIME, Kind.EPISODE)]
     vectors, labels = match_vectors(machine, labels)
     vectors, open_vectors = held_open(vectors)
-    labels, open_commands = _unravelled(machine, _called_as_joints(machine, labels), table)
+    labels = _called_as_actuators(machine, _called_as_joints(machine, labels), _SAYS_NOTHING)
+    labels, open_commands = _unravelled(machine, labels, table)
     offsets = _ordinals(labels)
     positions = _assigned(machine.joints, labels, Kind.POSITION, offsets)
     velocities = _by_position(positions, _assigned(machine.joints, labels, Kind.VELOCITY, offsets), table)
-    commands, rivals = _commands(machine, labels, offsets)
+    measured = {m.column for m in (*positions, *velocities)}
+    over = [x for x in labels if x.column not in measured]
+    commands, rivals = _commands(machine, _called_as_actuators(machine, over, _WANTED), offsets)
     forces = _forces(machine, labels, offsets, commands)
     used = {c for m in (*positions, *velocities, *commands, *vectors, *forces) for c in m.columns}
     left = tuple(name for name in table if name not in used)
@@ -144,6 +147,8 @@ _FORCE = {Kind.TORQUE: 3.0, Kind.COMMAND: 2.6, Kind.CURRENT: 2.0, Kind.VOLTAGE: 
 _VOLTS = {Kind.VOLTAGE: 3.0, Kind.DUTY: 2.8, Kind.COMMAND: 2.6, Kind.CURRENT: 0.5, Kind.TORQUE: 0.3, Kind.SETPOINT: 0.2}
 _ANY = {Kind.COMMAND: 3.0, Kind.DUTY: 2.8, Kind.SETPOINT: 2.4, Kind.TORQUE: 2.0, Kind.VOLTAGE: 2.0, Kind.CURRENT: 1.5}
 _DRIVING = {Kind.COMMAND, Kind.SETPOINT, Kind.SPEED_SETPOINT, Kind.TORQUE, Kind.DUTY}
+_WANTED = {Kind.POSITION: Kind.SETPOINT, Kind.VELOCITY: Kind.SPEED_SETPOINT}
+_SAYS_NOTHING = {Kind.UNKNOWN: Kind.COMMAND}
 _FITS: dict[Drive, dict[Kind, float]] = {
     Drive.FORCE: _FORCE,
     Drive.POSITION: {Kind.SETPOINT: 3.0, Kind.COMMAND: 2.6},
@@ -212,6 +217,31 @@ def _called_as_joints(machine: Machine, labels: list[Label]) -> list[Label]:
         replace(x, kind=Kind.POSITION) if x.kind == Kind.UNKNOWN and any(speaks(x, j) for j in open_joints) else x
         for x in labels
     ]
+
+
+def _called_as_actuators(machine: Machine, labels: list[Label], become: Mapping[Kind, Kind]) -> list[Label]:
+    """Labels of which those called as an actuator, and as no joint, drive it, where fewer columns drive than it needs.
+
+    Args:
+        machine: the model's.
+        labels: of the columns.
+        become: the kinds that may be such columns, and what they then are.
+    """
+    driving = [x for x in labels if x.kind in _DRIVING or x.kind in (Kind.CURRENT, Kind.VOLTAGE)]
+    if len(driving) >= len(machine.actuators):
+        return labels
+    undriven = [a.name for a in machine.actuators if not any(alike(x.words, a.name) > _CALLED for x in driving)]
+    joints = [name for joint in machine.joints for name in (joint.name, joint.body)]
+
+    def called(label: Label, names: Sequence[str]) -> float:
+        return max((alike(label.words, name) for name in names), default=0.0)
+
+    def drives(label: Label) -> bool:
+        family = label.kind is Kind.UNKNOWN and label.number is not None  # of such there is doubt
+        named = called(label, undriven) > max(_CALLED, called(label, joints))
+        return label.kind in become and not family and not label.measured and named
+
+    return [replace(x, kind=become[x.kind]) if drives(x) else x for x in labels]
 
 
 def _unravelled(machine: Machine, labels: list[Label], table: Table) -> tuple[list[Label], list[str]]:

@@ -129,3 +129,27 @@ def test_a_gyro_of_a_free_body(sensors: str, joint: str, target: str | None) -> 
         target == "body:base.angular_velocity"
     )
     assert [m.column for m in matches.positions] == [joint] * bool(joint)
+
+
+BEAM = """<mujoco><worldbody><body name="beam"><joint name="tilt"/><geom size=".1" mass="1"/><body name="ball">
+    <joint name="roll" type="slide"/><geom size=".1" mass="1"/></body></body></worldbody>
+    <actuator><{kind} name="servo" joint="tilt"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("columns", "driving", "measured"),
+    [
+        (["servo_deg", "beam_deg", "ball_mm"], "servo_deg", ["beam_deg", "ball_mm"]),
+        (["servo", "beam_deg", "ball_mm"], "servo", ["beam_deg", "ball_mm"]),
+        (["servo_cmd", "servo_deg", "ball_mm"], "servo_cmd", ["servo_deg", "ball_mm"]),  # which has its command
+        (["servo_temp", "beam_deg", "ball_mm"], None, ["beam_deg", "ball_mm"]),
+        (["u", "servo_deg", "beam_deg", "ball_mm"], "u", ["beam_deg", "ball_mm"]),
+        (["tilt_servo_deg", "ball_mm"], None, ["tilt_servo_deg", "ball_mm"]),  # called as the joint too
+    ],
+)
+def test_a_column_called_as_an_actuator_drives_it_where_nothing_else_does(
+    columns: list[str], driving: str | None, measured: list[str]
+) -> None:
+    matches = matched(Machine.of(mujoco.MjModel.from_xml_string(BEAM.format(kind="position"))), columns)
+    assert [m.column for m in matches.commands] == [driving] * (driving is not None)
+    assert [m.column for m in matches.positions] == measured
