@@ -336,7 +336,8 @@ def _unknowns(
     left = fit(trial, trial.given, delays_of(trial, logs[0].dt), rounds=12)
     late, note = delay_of(actuators, left, logs[0].dt)
     samples = left.finer if late else 0.0
-    shown = told_apart(unknowns, left, scale_is_open(model, machine, draft.readings))
+    given = trial.simulator.space.default_theta
+    shown = told_apart(unknowns, left, given, scale_is_open(model, machine, draft.readings))
     notes = [note] if note and not late else []
     notes += [*nameless(model, touching - {model.body(body).id for body in machine.bodies})]
     lost = trial.unfollowed(replace(trial.given, delay=left.best), left.theta)

@@ -25,6 +25,7 @@ from sipe_bayes.calibration.init.machine import (
     top_of,
     touched_by,
 )
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.sensing import of_sensor
 from sipe_bayes.envs.targets import bind
@@ -37,6 +38,7 @@ _NOTABLE = 0.03  # of its range, from which a spring is told
 _MOST = 20  # parameters that are asked for: what shows and is left out is in all others
 _WEAK = 3.0  # of the noise, what a parameter has to move over its range
 _APART = 0.05  # share of its effect that no other parameter has: less is how exactly a simulation repeats
+_EXACT = 0.01  # share below which it is another's effect whatever it costs: slopes are no better
 _CLEAR = 15.0  # of the noise, what it has to move by itself where its share is small
 _MIXED = 0.15  # a share that is small; with more it is asked for: friction that is left out is in all others
 _SLIPPERY = 0.02  # the least friction
@@ -301,12 +303,15 @@ def as_parameters(model: mujoco.MjModel, unknowns: Sequence[Unknown]) -> list[Pa
     return out
 
 
-def told_apart(unknowns: Sequence[Unknown], fit: Fit, open_scale: bool = False) -> list[Unknown]:
+def told_apart(unknowns: Sequence[Unknown], fit: Fit, given: FloatArray, open_scale: bool = False) -> list[Unknown]:
     """The unknowns, with the reason where one is better left out: it shows too little, or as another one does.
+
+    One that shows as others do is kept where leaving it at the model's own value would cost more than noise.
 
     Args:
         unknowns: of the fit, those first that are to be kept first.
         fit: with the effects of each.
+        given: (N,) of the model.
         open_scale: whether forces and masses are known relative to each other alone: the mass that shows most is left
             out, to which the others then are.
     """
@@ -328,7 +333,8 @@ def told_apart(unknowns: Sequence[Unknown], fit: Fit, open_scale: bool = False) 
             basis = effects[:, kept]
             weights = np.linalg.lstsq(basis, effect, rcond=None)[0]
             alone = float(np.linalg.norm(effect - basis @ weights))
-            if alone < _APART * size or (alone < _MIXED * size and alone < _CLEAR):
+            costs = alone * abs(float(fit.theta[k] - given[k])) > _WEAK and alone > _EXACT * size
+            if not costs and (alone < _APART * size or (alone < _MIXED * size and alone < _CLEAR)):
                 share = np.abs(weights) * np.linalg.norm(basis, axis=0)
                 names = " and ".join(unknowns[kept[i]].name for i in np.argsort(-share)[:2] if share[i] > 0.3 * size)
                 reason = f"shows as {names or unknowns[kept[int(np.argmax(share))]].name} does in these logs"

@@ -11,23 +11,29 @@ from sipe_bayes.calibration.init.unknowns import delay_of, sprung, told_apart
 
 
 @pytest.mark.parametrize(
-    ("share", "size", "kept"),
+    ("share", "size", "away", "kept"),
     [
-        (0.09, 600.0, True),  # dry friction at a usual speed is nearly viscous, but the logs tell it to a fiftieth
-        (0.09, 60.0, False),  # told to a fifth of its range
-        (0.02, 600.0, False),  # the same but for rounding
-        (0.4, 20.0, True),
-        (0.3, 8.0, True),  # weakly told, but what it would do is in others if it is left out
-        (1.0, 2.0, False),
+        (0.09, 600.0, 0.0, True),  # dry friction at a usual speed is nearly viscous, but the logs tell it to a fiftieth
+        (0.09, 60.0, 0.0, False),  # told to a fifth of its range
+        (0.09, 60.0, 0.4, False),  # two sds of noise, as often happens by itself
+        (0.1, 120.0, 0.6, True),  # seven, which the others would have to make up for
+        (0.02, 600.0, 0.0, False),  # the same but for rounding
+        (0.005, 2000.0, 0.9, False),
+        (0.4, 20.0, 0.0, True),
+        (0.3, 8.0, 0.0, True),  # weakly told, but what it would do is in others if it is left out
+        (1.0, 2.0, 0.0, False),
     ],
 )
-def test_what_is_nearly_the_same_is_asked_for_where_the_logs_tell_it(share: float, size: float, kept: bool) -> None:
+def test_what_is_nearly_the_same_is_asked_for_where_the_logs_tell_it(
+    share: float, size: float, away: float, kept: bool
+) -> None:
+    """Also where the model's own value, so far away, would cost more than noise."""
     rng = np.random.default_rng(0)
     basis = np.linalg.qr(rng.standard_normal((400, 2)))[0]
     both = np.stack([500 * basis[:, 0], size * (np.sqrt(1 - share**2) * basis[:, 0] + share * basis[:, 1])], axis=1)
     unknowns = [Unknown(name, (), 0.0, 1.0, False, "") for name in ("damping", "friction")]
     fit = Fit((0,), np.ones(1), np.full(2, 0.5), both, np.ones(1))
-    first, second = told_apart(unknowns, fit)
+    first, second = told_apart(unknowns, fit, np.full(2, 0.5 - away))
     assert not first.left_out
     assert (not second.left_out) is kept, second.left_out
 
