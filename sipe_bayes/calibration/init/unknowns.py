@@ -39,6 +39,8 @@ _MOST = 20  # parameters that are asked for: what shows and is left out is in al
 _WEAK = 3.0  # of the noise, what a parameter has to move over its range
 _APART = 0.05  # share of its effect that no other parameter has: less is how exactly a simulation repeats
 _EXACT = 0.01  # share below which it is another's effect whatever it costs: slopes are no better
+_PRESSED = 1e-3  # of its range: the fit would have gone on
+_BEYOND = 3.0  # times a bound that the fit presses against
 _CLEAR = 15.0  # of the noise, what it has to move by itself where its share is small
 _MIXED = 0.15  # a share that is small; with more it is asked for: friction that is left out is in all others
 _SLIPPERY = 0.02  # the least friction
@@ -306,7 +308,8 @@ def as_parameters(model: mujoco.MjModel, unknowns: Sequence[Unknown]) -> list[Pa
 def told_apart(unknowns: Sequence[Unknown], fit: Fit, given: FloatArray, open_scale: bool = False) -> list[Unknown]:
     """The unknowns, with the reason where one is better left out: it shows too little, or as another one does.
 
-    One that shows as others do is kept where leaving it at the model's own value would cost more than noise.
+    Bounds that the fit presses against are widened. One that shows as others do is kept where leaving it at the model's
+    own value would cost more than noise.
 
     Args:
         unknowns: of the fit, those first that are to be kept first.
@@ -342,8 +345,20 @@ def told_apart(unknowns: Sequence[Unknown], fit: Fit, given: FloatArray, open_sc
             reason = f"{_MOST} are enough to begin with"
         if not reason:
             kept.append(k)
-        out.append(replace(unknown, left_out=reason))
+        out.append(replace(unknown if reason else _roomy(unknown, float(fit.theta[k])), left_out=reason))
     return out
+
+
+def _roomy(unknown: Unknown, theta: float) -> Unknown:
+    """An unknown whose bounds leave room where the fit pressed against one; what is positive stays so."""
+    low, high = unknown.low, unknown.high
+    if theta < _PRESSED:
+        low = low / _BEYOND if low > 0 else low * _BEYOND
+    if theta > 1 - _PRESSED:
+        high *= _BEYOND
+    changed = (low, high) != (unknown.low, unknown.high)
+    note = f"{unknown.note}; bounds wider, since simulated windows press against the usual one"
+    return replace(unknown, low=float(f"{low:.2g}"), high=float(f"{high:.2g}"), note=note) if changed else unknown
 
 
 def sprung(unknowns: Sequence[Unknown], beside: Sequence[Unknown], fit: Fit) -> list[str]:

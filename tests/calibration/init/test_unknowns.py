@@ -38,6 +38,20 @@ def test_what_is_nearly_the_same_is_asked_for_where_the_logs_tell_it(
     assert (not second.left_out) is kept, second.left_out
 
 
+@pytest.mark.parametrize(
+    ("theta", "low", "high"),
+    [(0.5, 0.5, 2.0), (1.0, 0.5, 6.0), (0.0, 0.17, 2.0)],
+)
+def test_bounds_that_the_fit_presses_against_are_widened(theta: float, low: float, high: float) -> None:
+    unknown = Unknown("payload", (), 0.5, 2.0, True, "0.2 kg in the model")
+    fit = Fit((0,), np.ones(1), np.array([theta]), np.full((400, 1), 5.0), np.ones(1))
+    (kept,) = told_apart([unknown], fit, np.full(1, 0.3))
+    assert (kept.low, kept.high) == pytest.approx((low, high), abs=0.01)
+    assert ("wider" in kept.note) is (theta != 0.5)
+    friction = told_apart([Unknown("friction", (), 0.0, 1.0, False, "")], fit, np.zeros(1))[0]
+    assert friction.low == 0
+
+
 @pytest.mark.parametrize(("miss", "asked"), [([1.4, 1.1, 1.0, 1.2], True), ([1.5, 1.04, 1.02, 1.0], False)])
 def test_a_delay_at_the_end_of_those_tried_is_none(miss: list[float], asked: bool) -> None:
     """A force that the model lacks is met the better the later commands come."""
