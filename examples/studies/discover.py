@@ -131,9 +131,9 @@ def values(placed: Placed, machine: Machine, size: float) -> list[float]:
         "direction_friction": [force, 0.0],
         "stribeck": [2 * force, 0.2 * own.velocity],
         "load_friction": [size],
-        "delay": [DT * {0.05: 1, 0.1: 2, 0.2: 4}[size]],
+        "delay": [DT * {0.05: 1, 0.1: 2, 0.2: 4, 0.4: 8}[size]],
         "offset": [size * machine.commands.get(site, 1.0)],
-        "force_limit": [machine.forces.get(site, 1.0) * {0.05: 1.7, 0.1: 1.5, 0.2: 1.2}[size]],
+        "force_limit": [machine.forces.get(site, 1.0) * {0.05: 1.7, 0.1: 1.5, 0.2: 1.2, 0.4: 1.0}[size]],
         "force_drop": [size / machine.forces.get(site, 1.0)],
         "cogging": [force, 0.0, 7.0],
     }[name]

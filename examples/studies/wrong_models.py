@@ -2,6 +2,8 @@
 
     python examples/studies/wrong_models.py                       # hours
     python examples/studies/wrong_models.py --seeds 2
+    python examples/studies/wrong_models.py --seeds 2 --size 0.4 --effects load_friction delay direction_friction \
+        dry_friction gear_backlash gear_compliance spring offset
     python examples/studies/wrong_models.py --seeds 0             # the tables of what there is
 
 The machines of ``discover.py`` (a pendulum, a double pendulum, a slide; masses and damping unknown, truths drawn in .2
@@ -9,12 +11,13 @@ to .8 of their ranges; motors with inertia, without which nothing gives way in a
 different sizes, .5 % noise, as large in each. Planted at a joint, of a tenth of the joint's usual force: friction under
 load, a delay of two samples, dry friction that differs by direction, dry friction, backlash (3 % of what the joint
 moves) and compliance; and nothing. Each is fitted twice: with the library as it is, and without the planted extension
-in it (``unknown``), as where nobody has thought of what is missing.
+in it (``unknown``), as where nobody has thought of what is missing. ``--size`` plants another share of the force, where
+what is missing is no longer a small thing; springs and offsets too can then be asked for.
 
 Coverage is that of 90 % intervals, pooled over parameters: plain ones, those for a further log from the spread between
 the logs alone, and those with what the model lacks, which stand first where the residuals raise an alarm or the logs
 disagree; ``printed`` is what the report then shows first: these, and the plain ones within them. Every fit is one line
-in runs/, results/wrong_models.json holds the tables.
+in runs/, results/wrong_models.json holds the tables, wrong_models_40.json those of a size of .4.
 """
 
 from __future__ import annotations
@@ -55,24 +58,24 @@ from sipe_bayes.structure.machine import Machine, machine_of
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
 
 HERE = Path(__file__).parent
-RUNS = HERE / "runs" / "wrong_models.jsonl"
 EFFECTS = ("load_friction", "delay", "direction_friction", "dry_friction", "gear_backlash", "gear_compliance")
+MORE = ("spring", "offset")
 LOGS, SIZE = 6, 0.1
 KINDS = ("plain", "spread", "lacking", "printed")
 
 
-def truth_of(placed: Placed, machine: Machine) -> list[float]:
+def truth_of(placed: Placed, machine: Machine, size: float) -> list[float]:
     """The extension's parameters, by its force or by a share of what its joint moves."""
     if placed.extension.name in ("gear_backlash", "gear_compliance"):
         own = min(machine.joints[placed.site].position, 1.0)
-        return [0.03 * own, *(float(p.value(0.5)) for p in placed.parameters[1:])]
-    return values(placed, machine, SIZE)
+        return [0.3 * size * own, *(float(p.value(0.5)) for p in placed.parameters[1:])]
+    return values(placed, machine, size)
 
 
-def recorded(name: str, effect: str, seed: int) -> tuple[sipe.Simulator, np.ndarray, Trajectories]:
+def recorded(name: str, effect: str, seed: int, size: float) -> tuple[sipe.Simulator, np.ndarray, Trajectories]:
     """The plain model, the truth (N,) in theta, and the logs of a machine that has an effect."""
     simulator = plain(name)
-    rng = np.random.default_rng([seed, [*MACHINES].index(name), ("null", *EFFECTS).index(effect)])
+    rng = np.random.default_rng([seed, [*MACHINES].index(name), ("null", *EFFECTS, *MORE).index(effect)])
     actions = [commands(name, rng)[0] * rng.uniform(0.5, 1.3) for _ in range(LOGS)]
     truth = rng.uniform(0.2, 0.8, len(simulator.space))
     engine, theta, start = simulator, truth, simulator.default_state()[None]
@@ -85,7 +88,7 @@ def recorded(name: str, effect: str, seed: int) -> tuple[sipe.Simulator, np.ndar
         one = choices[seed % len(choices)]
         assert isinstance(simulator.environment, MjcfEnvironment)
         engine = sipe.Simulator(extended(simulator.environment, [one]), num_threads=1)
-        own = [float(p.normalise(v)) for p, v in zip(one.parameters, truth_of(one, machine), strict=True)]
+        own = [float(p.normalise(v)) for p, v in zip(one.parameters, truth_of(one, machine, size), strict=True)]
         theta, start = np.concatenate([truth, own]), engine.default_state()[None]
     clean = [engine.rollout(theta[None], command[None], start, DT) for command in actions]
     if not all(one.valid.all() for one in clean):
@@ -98,9 +101,9 @@ def recorded(name: str, effect: str, seed: int) -> tuple[sipe.Simulator, np.ndar
     return simulator, truth, Trajectories.stack(logs)
 
 
-def fitted(name: str, effect: str, seed: int) -> Iterator[dict[str, Any]]:
+def fitted(name: str, effect: str, seed: int, size: float) -> Iterator[dict[str, Any]]:
     """One fit, a row for each library: with the effect in it and, where there is one, without."""
-    simulator, truth, logs = recorded(name, effect, seed)
+    simulator, truth, logs = recorded(name, effect, seed, size)
     method, began = Laplace(simulator, seed=seed), time.process_time()
     posterior = method.fit(logs)
     fit_s, theta = time.process_time() - began, posterior.mode.numpy()
@@ -186,7 +189,7 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, Any]:
             out[what] = shares(mine)
             out[f"{what}, by effect"] = {
                 effect: shares([row for row in mine if row["effect"] == effect])
-                for effect in EFFECTS
+                for effect in (*EFFECTS, *MORE)
                 if any(row["effect"] == effect for row in mine)
             }
     return out
@@ -197,22 +200,24 @@ def main() -> None:
     parser.add_argument("--machines", nargs="+", default=list(MACHINES))
     parser.add_argument("--effects", nargs="+", default=["null", *EFFECTS])
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--out", type=Path, default=RUNS)
+    parser.add_argument("--size", type=float, default=SIZE, choices=(0.05, SIZE, 0.2, 0.4))
     given = parser.parse_args()
-    rows = fits(given.out)
+    name = "wrong_models" if given.size == SIZE else f"wrong_models_{100 * given.size:.0f}"
+    runs, results = HERE / "runs" / f"{name}.jsonl", HERE / "results" / f"{name}.json"
+    rows = fits(runs)
     done = {(r["machine"], r["effect"], r["seed"]) for r in rows if r["unknown"] or r["effect"] == "null"}
-    for seed, name, effect in product(range(given.seeds), given.machines, given.effects):
-        if (name, effect, seed) in done:
+    for seed, machine, effect in product(range(given.seeds), given.machines, given.effects):
+        if (machine, effect, seed) in done:
             continue
-        for row in fitted(name, effect, seed):
-            rows.append(keep(given.out, row))
+        for row in fitted(machine, effect, seed, given.size):
+            rows.append(keep(runs, row))
             truth = np.array(row["truth"])
             held = {
                 k: int(((np.array(v[0]) <= truth) & (truth <= np.array(v[1]))).sum()) for k, v in row["ends"].items()
             }
             told = row["unknown"], held, "of", len(truth), row["alarm"], row["causes"], row["fit_s"], row["checks_s"]
-            print(name, effect, seed, *told, flush=True)
-        write_text(HERE / "results" / "wrong_models.json", json.dumps(tables(rows), indent=1) + "\n")
+            print(machine, effect, seed, *told, flush=True)
+        write_text(results, json.dumps(tables(rows), indent=1) + "\n")
     print(json.dumps({k: v for k, v in tables(rows).items() if "by effect" not in k}, indent=1))
 
 
