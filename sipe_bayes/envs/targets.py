@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.validation import nearest_name
+from sipe_bayes.envs.actuator_units import actuator_unit
 from sipe_bayes.envs.contact_targets import GEOM_CONTACTS, PAIR_CONTACTS, pair_index
 from sipe_bayes.envs.inertia import body_frame_inertia
 from sipe_bayes.envs.internal.elastic import ELASTIC, NUMBERS, motor_side, realise
@@ -54,7 +55,8 @@ def bind(model: mujoco.MjModel, spec: str) -> Target:
         index = 0 if kind == "option" else pair_index(model, name, spec)
     else:
         index = named(model, kind, name, f"target {spec!r}")
-    return legal[attribute](model, spec, index)
+    target = legal[attribute](model, spec, index)
+    return replace(target, unit=actuator_unit(model, index, target.unit)) if kind == "actuator" else target
 
 
 def _hinge(model: mujoco.MjModel, joint: int) -> bool:

@@ -67,8 +67,9 @@ def listed(names: Sequence[str]) -> str:
 def unit_text(unit: str) -> str:
     """``unit`` for the eye: "kg m^2" with a raised 2, nothing for the unit "1", of an actuator what it may be."""
     of, per, by = unit.partition("/")
-    if of == "force":
-        return f"N or N m{f' per {_PER.get(by, by)}' if per else ''}"
+    if of == "force" or by == "command":
+        top = "N or N m" if of == "force" else of
+        return f"{top} per {_PER.get(by, by)}" if per else top
     return "" if unit == "1" else re.sub(r"\^(-?\d+)", lambda power: power[1].translate(_RAISED), unit)
 
 

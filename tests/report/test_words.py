@@ -33,6 +33,7 @@ def test_one_unit_stands_beside_a_name(name: str, unit: str, text: str) -> None:
         ("rad/s", "rad/s"),
         ("force", "N or N m"),
         ("force/command", "N or N m per unit of command"),
+        ("N m/command", "N m per unit of command"),
         ("force/velocity", "N or N m per rad/s or m/s"),
         ("force/(position s)", "N or N m per (position s)"),
     ],
