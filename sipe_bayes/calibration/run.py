@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sipe_bayes.calibration.checks.fitted import Fit, from_fitted_states, one_by_one, tamed
+from sipe_bayes.calibration.checks.fitted import Fit, from_fitted_states, one_by_one, tamed, with_wild
 from sipe_bayes.calibration.checks.followed import not_followed
 from sipe_bayes.calibration.checks.lacking import lacking
 from sipe_bayes.calibration.checks.plan import Checks, expected_rollouts, with_checks
@@ -117,7 +117,7 @@ def calibrate(
         outside=list(outside.logs),
         noise=fit.channel_noise(),
         mixing=_mixing(method),
-        logs=list(problem.reports),
+        logs=with_wild(problem, method),
         rollouts=method.rollouts,
         seconds=time.monotonic() - began,
     )

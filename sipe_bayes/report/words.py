@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.units import UNITS
+from sipe_bayes.diagnostics.records import ChannelNoise
 
 _PER = {"command": "unit of command", "position": "rad or m", "velocity": "rad/s or m/s"}  # of an actuator's numbers
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -57,6 +58,14 @@ def times(ratio: float) -> str:
         return "about the same"
     factor, word = (ratio, "smaller") if ratio > 1 else (1 / ratio, "larger")
     return f"{factor:.1f} times {word}" if factor < 9.95 else f"{number(factor, 2)} times {word}"
+
+
+def correlation_time(noise: ChannelNoise) -> str:
+    """How long noise remembers, in words; where it is at its limit, that it is."""
+    if not noise.tau:
+        return "white"
+    text = f"{number(noise.tau)} s"
+    return f"{text} or more (as long as the logs)" if noise.tau_at_limit else text
 
 
 def listed(names: Sequence[str]) -> str:
