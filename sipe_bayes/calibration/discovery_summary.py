@@ -17,11 +17,11 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.bands import predictive_bands
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors, Piece, Promise, Stage
 from sipe_bayes.diagnostics.evaluate import (
+    channel_noise,
     compare_errors,
     errors,
     errors_from_best_starts,
     fitted_residuals,
-    channel_noise,
     fitted_units,
     measured_starts,
     signals,

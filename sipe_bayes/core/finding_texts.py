@@ -166,7 +166,8 @@ class Code(Enum):
         "the search had not settled after {steps} steps: look at the residuals before you trust the intervals"
     )
     WILD_SAMPLES = caution(
-        "{count} samples of {channels} in {logs} logs were left out of the fit: no smooth motion explains them (glitches)"
+        "{count} samples of {channels} in {logs} logs were left out of the fit: no smooth motion explains them "
+        "(glitches)"
     )
     NOT_SMOOTH = blocking(
         "at the optimum the simulation is not what its linearisation says, by {gain:.1f} nats of a step or of a "

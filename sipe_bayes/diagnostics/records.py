@@ -348,7 +348,7 @@ class LogReport:
         resampled: whether samples were interpolated.
         gaps: (start, stop) in s from the trajectory's first sample, without a measurement for longer than ``max_gap``.
         missing: masked samples of each channel.
-        wild: samples of each channel that were left out, at reading or by the fit, since no smooth motion explains them.
+        wild: samples of each channel left out at reading or by the fit, since no smooth motion explains them.
         clipped: samples of each channel and command (``actuator:NAME``) in runs at its extreme value.
         findings: the same in words, with what the user should know.
     """

@@ -17,13 +17,12 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.validation import nearest_name
-from sipe_bayes.envs.actuator_units import actuator_unit
 from sipe_bayes.envs.contact_targets import GEOM_CONTACTS, PAIR_CONTACTS, pair_index
 from sipe_bayes.envs.inertia import body_frame_inertia
 from sipe_bayes.envs.internal.elastic import ELASTIC, NUMBERS, motor_side, realise
 from sipe_bayes.envs.laws.base import SINGLE, Number
 from sipe_bayes.envs.laws.registry import LAW_OF
-from sipe_bayes.envs.target import Check, Maker, Target, TargetError, entry, named
+from sipe_bayes.envs.target import Check, Maker, Target, TargetError, actuator_unit, entry, named
 
 _PATTERN = re.compile(r"^(?:(body|joint|actuator|geom|pair):(.+)|(option))\.([a-z0-9_]+)$")
 _AXES = ("x", "y", "z")

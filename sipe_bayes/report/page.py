@@ -101,7 +101,7 @@ def _score_row(score: ChannelScore) -> dict[str, str]:
 
 def _noise_row(channel: str, noise: ChannelNoise) -> dict[str, str]:
     size = {"sd": number(noise.sd), "unit": unit_text(noise.unit)}
-    return {"channel": channel, **size, "tau": correlation_time(noise), "at_limit": noise.tau_at_limit}
+    return {"channel": channel, **size, "tau": correlation_time(noise)}
 
 
 def _compared(comparison: Comparison | None) -> str:

@@ -398,27 +398,3 @@ def test_wrong_targets_are_named(target: str, words: str) -> None:
     with pytest.raises(TargetError, match=words) as caught:
         bind(mujoco.MjModel.from_xml_string(xml), target)
     assert repr(target) in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("target", "unit"),
-    [
-        ("actuator:velocity.gain", "N m s/rad"),
-        ("actuator:velocity.offset", "rad/s"),
-        ("actuator:position.gain", "N/m"),
-        ("actuator:position.offset", "m"),
-        ("actuator:general.gain", "N m/command"),
-        ("actuator:motor.offset", "command"),
-    ],
-)
-def test_a_servo_s_command_has_the_unit_of_what_it_is_compared_with(target: str, unit: str) -> None:
-    assert bind(frozen_spec().compile(), target).unit == unit
-
-
-def test_an_actuator_without_a_joint_keeps_its_words() -> None:
-    pulled = """<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody><tendon>
-      <fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>
-      <actuator><motor name="m" tendon="t"/></actuator></mujoco>"""
-    model = mujoco.MjModel.from_xml_string(pulled)
-    assert bind(model, "actuator:m.gain").unit == "force/command"
-    assert bind(model, "actuator:m.bias_velocity").unit == "force/velocity"

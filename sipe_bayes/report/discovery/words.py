@@ -8,7 +8,7 @@ from sipe_bayes.core.findings import Code, Findings
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors, Piece
 from sipe_bayes.report.verdicts import Verdict
-from sipe_bayes.report.words import correlation_time, error_text, listed, number, significant, unit_text
+from sipe_bayes.report.words import correlation_time, error_text, listed, significant, unit_text
 from sipe_bayes.structure.structures import StructureRow
 
 _SURE = 0.995  # a probability from which no more digits are told
