@@ -322,12 +322,3 @@ def test_samples_that_the_fit_left_out_are_counted_with_them(monkeypatch: pytest
     monkeypatch.setattr(Laplace, "wild", np.array([[0, 5, 0], [0, 6, 0], [0, 7, 0]]))
     (counted,) = with_wild(cast(Problem, problem), Laplace.__new__(Laplace))
     assert counted.wild == {"q": 5}
-
-
-def test_samples_left_out_as_wild_are_counted(tmp_path: Path) -> None:
-    columns = {"t": np.arange(400) * 0.01, "u": np.zeros(400), "q": np.sin(np.arange(400) * 0.02)}
-    assert load(tmp_path, columns)[1].wild == {}
-    columns["q"][[100, 250]] += 20.0
-    report = load(tmp_path, columns)[1]
-    assert report.wild == {"q": 2}
-    assert any("no smooth motion" in note for note in report.notes)

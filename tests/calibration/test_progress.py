@@ -12,7 +12,6 @@ from sipe_bayes.inference.laplace.forecast import usual_rest, usual_rollouts
 from sipe_bayes.inference.laplace.windows.state import Phase, Position, WindowState
 from sipe_bayes.inference.recorded import Tell
 from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.noise import Noise
 
 PLAN = Plan({Check.LOGS: 1000, Check.RANGES: 50}, logs=200)
 

@@ -121,8 +121,6 @@ def test_posterior_is_read_back(finished: tuple[Path, Path, Any]) -> None:
         assert abs(draws.mean() - p["mean"]) < 6 * p["sd"] / np.sqrt(draws.size)
     again = posterior.netcdf(torch.Generator().manual_seed(0))
     assert again == (out / "posterior.nc").read_bytes(), "the same draws each time"
-    again = posterior.netcdf(torch.Generator().manual_seed(0))
-    assert again == (out / "posterior.nc").read_bytes(), "the same draws each time"
 
 
 def test_identified_model_carries_the_mode(finished: tuple[Path, Path, Any]) -> None:

@@ -72,32 +72,3 @@ def test_names_break_at_underscores_and_are_escaped() -> None:
 def test_one_is_one(text: str, one: str) -> None:
     assert singular(text) == one
     assert "q: 1 sample masked" in finding(Code.LOG_WILD, channel="q", count=1).text
-
-
-@pytest.mark.parametrize(
-    ("noise", "text"),
-    [
-        (ChannelNoise(0.1, 0.0), "white"),
-        (ChannelNoise(0.1, 0.25), "0.25 s"),
-        (ChannelNoise(0.1, 12.0, tau_at_limit=True), "12 s or more (as long as the logs)"),
-    ],
-)
-def test_a_correlation_time_at_its_limit_is_not_told_as_if_it_were_measured(noise: ChannelNoise, text: str) -> None:
-    assert correlation_time(noise) == text
-
-
-def test_names_break_at_underscores_and_are_escaped() -> None:
-    assert breakable("pan_drive_kv") == "pan_<wbr>drive_<wbr>kv"
-    assert breakable("a<b_c") == "a&lt;b_<wbr>c"
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("1 samples in 1 logs", "1 sample in 1 log"),
-        ("1 of 21 samples, 0.1 samples, 11 logs", "1 of 21 samples, 0.1 samples, 11 logs"),
-    ],
-)
-def test_one_is_one(text: str, said: str) -> None:
-    assert singular(text) == said
-    assert "q: 1 sample masked" in finding(Code.LOG_WILD, channel="q", count=1).text
