@@ -21,6 +21,7 @@ from sipe_bayes.calibration.config_fields import (
     EstimatorName,
     Location,
     Table,
+    Tolerance,
     Use,
     Window,
     nearest_file,
@@ -68,7 +69,7 @@ class Config(Table):
     budget: Budget | None = None
     """rollouts of the search: one parameter vector simulated over one log; default the estimator's own. Checks
     afterwards (each log alone, dead ranges, what the model lacks, the prior's simulations, bands) come on top"""
-    geometry_tolerance: Annotated[float, Strict(), Field(ge=0, le=1)] = GEOMETRY
+    geometry_tolerance: Tolerance = GEOMETRY
     """sd of where centres of mass lie, as a share of the body's radius of gyration about the joint that turns it;
     intervals with what the model lacks allow for it where no log tells. 0: exact"""
     search: Search = Search()
@@ -166,6 +167,10 @@ class Config(Table):
                     raise problem(message, "logs", i, "use")
 
 
+_ABOVE = frozenset(Config.model_fields)
+"""Keys of the whole file, which TOML takes for a table's where they stand below its header."""
+
+
 def _check_unique(table: str, key: str, words: Sequence[str]) -> None:
     for i, word in enumerate(words):
         if word in words[:i]:
@@ -224,7 +229,7 @@ def load_config(path: str | Path) -> Config:
     with reading(path, "a configuration", "correct it", ConfigError):
         try:
             data = tomllib.loads(text)
-            config = Config.model_validate(data, context={"folder": path.parent})
+            config = Config.model_validate(data, context={"folder": path.parent, "above": _ABOVE})
         except tomllib.TOMLDecodeError as error:
             raise ConfigError(f"{path}: not valid TOML: {error}; correct that line") from None
         except ValidationError as error:

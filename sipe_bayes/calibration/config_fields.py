@@ -186,6 +186,12 @@ def _sized(value: float) -> float:
     return value
 
 
+def _share(value: float) -> float:
+    if not 0 <= value <= 1:
+        raise problem(f"expected a share from 0 to 1, got {value:g}; give one such as 0.05, or 0 where it is exact")
+    return value
+
+
 def _target(word: str) -> str:
     parse_measurement_target(word)
     return word
@@ -198,6 +204,8 @@ Budget = Annotated[int, Strict(), Field(gt=0, le=MOST_ROLLOUTS)]
 Use = Literal["train", "holdout"]
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False), AfterValidator(_sized)]
 Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False), AfterValidator(_sized)]
+Tolerance = Annotated[float, Strict(), AfterValidator(_share)]
+"""How far off a number of the model may be, as a share."""
 Pair = tuple[Number, Number]
 Location = Annotated[Path, BeforeValidator(_resolved)]
 UnitWord = Annotated[str, Strict(), _read_by(lambda word: find_unit(word).word)]
@@ -221,11 +229,14 @@ class Table(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _known_keys(cls, data: Any) -> Any:
+    def _known_keys(cls, data: Any, info: ValidationInfo) -> Any:
         if not isinstance(data, Mapping):
             return data
+        above = (info.context or {}).get("above", ())
         legal = [field.alias or name for name, field in cls.model_fields.items()] + list(cls.also)
         for key in data:
+            if key not in legal and key in above:
+                raise problem("a key of the whole file, not of a table; put it above the first line with [", str(key))
             if key not in legal:
                 raise problem(f"unknown key; {nearest(str(key), legal)}", str(key))
         return data

@@ -20,6 +20,7 @@ from sipe_bayes.calibration.config_fields import (
     TargetWord,
     Text,
     TimeWord,
+    Tolerance,
     UnitWord,
     Use,
     VoltageWord,
@@ -90,7 +91,7 @@ class Command(Table):
     """what the column is multiplied by beside its unit"""
     zero: Number = 0.0
     """what the column says where the model's command is 0; taken off before all else"""
-    tolerance: Annotated[float, Strict(), Field(ge=0, le=1)] = COMMANDS
+    tolerance: Tolerance = COMMANDS
     """sd of what a motor or position servo delivers, as a share of what the column says: a motor constant is known to
     about a tenth, and masses are off by as much. The intervals with what the model lacks allow for it. 0: exact"""
     rate: Positive | None = None
@@ -150,7 +151,7 @@ class Measurement(Table):
     wraps: Annotated[bool, Strict()] = False
     """`true`: the angle comes round, and jumps by a turn are taken out"""
     fit: Annotated[bool, Strict()] = True
-    """`false`: starts windows and is drawn, but is not fitted"""
+    """`false`: not fitted; it only tells where simulations start, and is drawn"""
     noise_sd: Positive | None = None
     """standard deviation of the noise in SI, where known; default estimated"""
     name: Text = ""

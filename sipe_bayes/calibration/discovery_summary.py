@@ -17,6 +17,7 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.bands import predictive_bands
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors, Piece, Promise, Stage
 from sipe_bayes.diagnostics.evaluate import (
+    channel_noise,
     compare_errors,
     errors,
     errors_from_best_starts,
@@ -28,7 +29,7 @@ from sipe_bayes.diagnostics.evaluate import (
 from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
-from sipe_bayes.diagnostics.records import ChannelNoise, Comparison, Signal
+from sipe_bayes.diagnostics.records import Comparison, Signal
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.unknowns import bounded_by_nature
 from sipe_bayes.inference.recorded import Tell, silent
@@ -203,12 +204,10 @@ class _Model:
         fitting = self.structures.search.fitting
         simulator = self.structures.simulator(self.one)
         windows, one = fitting.windows(simulator), self.one
-        rows = zip(one.sd.tolist(), one.tau.tolist(), fitted_units(windows), strict=True)
-        noise = {channel: ChannelNoise(*row) for channel, row in zip(windows.fitted, rows, strict=True)}
         residuals = fitted_residuals(windows, one.theta, one.noise, one.starts)
         sd = self.structures.posterior_of(one).stddev.numpy()
         seen = None if self.probed is None else misfit(self.probed, sd, seed)
-        return Stage(noise, seen, tuple(residuals))
+        return Stage(channel_noise(windows, one.noise), seen, tuple(residuals))
 
 
 def _errors(use: str, before: _Model, after: _Model, logs: Trajectories) -> list[ModelErrors]:

@@ -39,7 +39,7 @@ class Recording:
         measurements: of each channel.
         supplies: voltages by which commands are multiplied, by their number.
         late: s that were left out before the first command of a clock of its own.
-        wild: of each measurement, samples that were masked because no motion passes through them.
+        wild: of each measurement, samples that were masked because no smooth motion explains them.
     """
 
     time: FloatArray

@@ -63,7 +63,7 @@ def report_of(
     holes = gaps(np.any(finite, axis=-1), grid.dt, config.resample.max_gap)
     jitter = _jitter(raw.time)
     note = functools.partial(finding, log=log.name)
-    wild = zip(config.measurements, raw.wild, strict=True)
+    wild = {m.name: n for m, n in zip(config.measurements, raw.wild, strict=True) if n}
     own = [y for y in raw.measurements if y.time is not raw.time]
     return LogReport(
         name=log.name,
@@ -76,6 +76,7 @@ def report_of(
         resampled=not all(grid.on_clock(y.time).regular for y in own) or not grid.regular,
         gaps=holes,
         missing=missing,
+        wild=wild,
         clipped=clipped,
         findings=(
             note(
@@ -86,7 +87,7 @@ def report_of(
                 jitter_ms=1e3 * jitter,
             ),
             *_of_clocks(config, log, raw),
-            *(note(Code.LOG_WILD, channel=m.name, count=n) for m, n in wild if n),
+            *(note(Code.LOG_WILD, channel=c, count=n) for c, n in wild.items()),
             *(note(Code.LOG_GAP, start=start, stop=stop) for start, stop in holes),
             *(
                 note(Code.LOG_RATE, channel=c, rate=f"{1 / (n * grid.dt):.4g} Hz", every=n)

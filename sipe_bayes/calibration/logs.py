@@ -149,7 +149,7 @@ def _read_log(config: Config, log: LogEntry, table: Columns) -> Recording:
         return times[name]
 
     def signal(entry: Command | Measurement, name: str) -> Series:
-        column = _column(log, table, name)
+        column = _column(config, log, table, name)
         time = time_of(name)
         values = _fitted(name, column, len(time))
         values = convert(np.where(np.isfinite(values), values, np.nan) - entry.zero, entry.unit)
@@ -197,7 +197,7 @@ def _read_log(config: Config, log: LogEntry, table: Columns) -> Recording:
 
 
 def _tame(config: Config, columns: list[Series]) -> tuple[list[Series], list[int]]:
-    """The measured columns without samples of positions that no motion passes through, and how many of each had."""
+    """The measured columns without samples of positions that no smooth motion explains, and how many of each had."""
     rest, tame, counts = iter(columns), [], []
     for entry in config.measurements:
         own = [next(rest) for _ in entry.sources]
@@ -244,7 +244,7 @@ def _seconds(config: Config, log: LogEntry, table: Columns, name: str) -> FloatA
     """A clock of the log (n,) in s, which increases."""
     clock = config.columns.time
     remedy = "; a log without a clock needs its Hz, `columns.time.rate`" if name == clock.column else ""
-    time = _column(log, table, name, remedy)
+    time = _column(config, log, table, name, remedy)
     _check_clock(name, time)
     time = convert(time, clock.unit, "time")
     period, duration = float(np.median(np.diff(time))), float(time[-1]) - float(time[0])
@@ -281,10 +281,24 @@ def _apart(column: str, time: FloatArray, lead: FloatArray) -> LogError:
     )
 
 
-def _column(log: LogEntry, table: Columns, name: str, remedy: str = "") -> FloatArray:
+def _key_of(config: Config, column: str) -> str:
+    """Where the configuration names a column."""
+    for i, m in enumerate(config.measurements):
+        if column in m.sources:
+            return f"measurements[{i}].{'columns' if m.columns else 'column'}"
+    for i, c in enumerate(config.commands):
+        if column == c.column:
+            return f"commands[{i}].column"
+        if c.supply is not None and column == c.supply.column:
+            return f"commands[{i}].supply.column"
+    return "columns.time.column"
+
+
+def _column(config: Config, log: LogEntry, table: Columns, name: str, remedy: str = "") -> FloatArray:
     """One column as numbers (n,)."""
     if name not in table:
-        raise LogError(f"no column {name!r} in {log.file.name}; {nearest(name, table)}{remedy}")
+        where = f"key `{_key_of(config, name)}`: no column {name!r} in {log.file.name}"
+        raise LogError(f"{where}; {nearest(name, table)}{remedy}")
     values = table[name]
     try:
         if values.dtype.kind not in "cV":  # complex numbers and records would lose a part of themselves

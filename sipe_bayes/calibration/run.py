@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sipe_bayes.calibration.checks.fitted import Fit, from_fitted_states, one_by_one, tamed
+from sipe_bayes.calibration.checks.fitted import Fit, from_fitted_states, one_by_one, tamed, with_wild
 from sipe_bayes.calibration.checks.followed import not_followed
 from sipe_bayes.calibration.checks.lacking import lacking
-from sipe_bayes.calibration.checks.plan import Checks, expected_rollouts, with_checks
+from sipe_bayes.calibration.checks.plan import Checks, Plan, plan_of, rollouts_of, with_checks
 from sipe_bayes.calibration.checks.predictions import Predictions, every_channel, place_in_prior
 from sipe_bayes.calibration.checks.ranges import ranges_that_change_nothing
 from sipe_bayes.calibration.gathered import Marginals, most_probable, of_logs, uneven_targets, unmeasured_starts
@@ -117,7 +117,7 @@ def calibrate(
         outside=list(outside.logs),
         noise=fit.channel_noise(),
         mixing=_mixing(method),
-        logs=list(problem.reports),
+        logs=with_wild(problem, method),
         rollouts=method.rollouts,
         seconds=time.monotonic() - began,
     )
@@ -127,17 +127,17 @@ def _fitted(
     problem: Problem, method: Estimator, checkpoint: Path | None, progress: Progress | None
 ) -> tuple[Posterior, Checks]:
     """The posterior, and the checks that come after it, with what an interrupted run kept of them."""
-    expected = {}
+    plan = Plan()
     if progress is not None:
-        expected = expected_rollouts(problem, method)
-        method.progress = with_checks(progress, expected)
+        plan = plan_of(problem, method)
+        method.progress = with_checks(progress, plan, method, len(problem.train))
     posterior = method.fit(problem.train)
     held = None if problem.holdout is None else digest(problem.holdout)
     versions = {name: installed_version(name) for name in PACKAGES}
     setup = problem.config.model_dump(mode="json", by_alias=True), method.settings(), digest(problem.train), held
     folder = None if checkpoint is None else checkpoint.parent / CHECKS
     kept = Kept(folder, fingerprint_of(repr(setup), versions, method.snapshot))
-    return posterior, Checks(kept, progress, method.rollouts, expected)
+    return posterior, Checks(kept, progress, method.rollouts, plan, rollouts_of(problem))
 
 
 def _mixing(method: Estimator) -> Mixing | None:

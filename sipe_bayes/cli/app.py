@@ -260,7 +260,7 @@ def _print_parameters(console: Console, calibration: Calibration, findings: Find
 
     wider = any(p.further is not None for p in calibration.parameters)
     table, words = Table(box=None, pad_edge=False), ["unit", "verdict"]
-    numbers = ["value", *[f"with what it {lacking(findings)}"] * wider, "plain" if wider else "90 % interval"]
+    numbers = ["value (mode)", *[f"with what it {lacking(findings)}"] * wider, "plain" if wider else "90 % interval"]
     for heading in ("parameter", *numbers, *words):
         table.add_column(heading, justify="right" if heading in numbers else "left", no_wrap=True)
     shown = calibration.parameters
@@ -300,7 +300,7 @@ def _pooled(calibration: Calibration) -> list[str]:
         own, given = (math.sqrt(sum(e * e for e in rmse) / len(logs)) for rmse in _errors(mine))
         where = f"{title} {logs[0]}" if len(logs) == 1 else f"{title}, {len(logs)} logs"
         ratio = times(given / own if own else float("inf"))
-        lines.append(f"{where}, {quantity}: RMSE {own:.3g} {mine[0].unit}; model as given {given:.3g} (now {ratio})")
+        lines.append(f"{where}, {quantity}: RMSE {own:.3g} {mine[0].unit}; model as given {given:.3g} (here {ratio})")
     more = len(lines) - _CHANNELS
     return lines if more <= 0 else [*lines[: _CHANNELS - 1], f"{lines[_CHANNELS - 1]} [{more} more in the report]"]
 

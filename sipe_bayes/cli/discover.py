@@ -94,6 +94,7 @@ def print_discovery(discovery: Discovery) -> None:
 
 def lines_of(discovery: Discovery) -> list[str]:
     """What is printed above the answer."""
+    from sipe_bayes.core.findings import singular
     from sipe_bayes.report.discovery.words import (
         chance,
         error_line,
@@ -104,7 +105,7 @@ def lines_of(discovery: Discovery) -> list[str]:
     )
 
     of_columns = f" ({discovery.column_rollouts} for signs and units of columns)" if discovery.column_rollouts else ""
-    effort = f"{len(discovery.rows)} structures fitted, {discovery.rollouts} rollouts{of_columns}"
+    effort = singular(f"{len(discovery.rows)} structures fitted, {discovery.rollouts} rollouts{of_columns}")
     effort += f", {discovery.seconds:.0f} s"
     lines = [f"{discovery.name}, what the model lacks: {effort}"]
     tried = [f"{'nats over the model as it was':60}{'evidence':>9}{'held out':>9}{'probability':>12}"]

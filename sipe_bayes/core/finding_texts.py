@@ -166,7 +166,8 @@ class Code(Enum):
         "the search had not settled after {steps} steps: look at the residuals before you trust the intervals"
     )
     WILD_SAMPLES = caution(
-        "{count} samples of {channels} in {logs} logs were left out of the fit: no motion passes through them"
+        "{count} samples of {channels} in {logs} logs were left out of the fit: no smooth motion explains them "
+        "(glitches)"
     )
     NOT_SMOOTH = blocking(
         "at the optimum the simulation is not what its linearisation says, by {gain:.1f} nats of a step or of a "
@@ -332,7 +333,7 @@ class Code(Enum):
         "{channel} jumps {count} times between two samples, first at {when:.4g} s, where nothing moves so fast: a "
         "counter or an angle that came round, wild samples or lost ones; they rule a fit: mask them or cut the log"
     )
-    LOG_WILD = caution("{channel}: {count} samples masked that no motion passes through: glitches or lost packets")
+    LOG_WILD = caution("{channel}: {count} samples masked that no smooth motion explains: glitches or lost packets")
     LOG_SLOW = caution(
         "{channels} were recorded at {rate}: too slowly to see what friction and delays do, whose estimates will be "
         "biased; log joints and bodies at 100 Hz or more"

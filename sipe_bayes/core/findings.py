@@ -7,13 +7,15 @@ views of one list. All texts stand in ``core.finding_texts``; whatever is put th
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 
 from sipe_bayes.core.finding_texts import TEXTS, Code, Severity
 
-__all__ = ["Code", "Finding", "Findings", "Severity", "finding", "p_text", "rank"]
+__all__ = ["Code", "Finding", "Findings", "Severity", "finding", "p_text", "rank", "singular"]
 
+_ONE = re.compile(r"(?<![\w.,])1 (column|draw|group|log|sample|simulation|step|structure|window)s\b")
 _LACKS = (Code.MISFIT, Code.MISFIT_SHIFTS)
 _UNFINISHED = (
     Code.BUDGET_SPENT,
@@ -79,7 +81,12 @@ def finding(
     text = TEXTS[code]
     names = tuple(parameters)
     places = {"parameters": ", ".join(names), "log": log, **values}
-    return Finding(code, severity or text.severity, text.template.format(**places), names, log)
+    return Finding(code, severity or text.severity, singular(text.template.format(**places)), names, log)
+
+
+def singular(text: str) -> str:
+    """The text with one sample where it said ``1 samples``."""
+    return _ONE.sub(r"1 \1", text)
 
 
 def p_text(p: float, floor: float) -> str:

@@ -17,7 +17,7 @@ import torch
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
-from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Residual, Signal
+from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Residual, Signal
 from sipe_bayes.inference.laplace.options import GrowingTuning
 from sipe_bayes.inference.laplace.windows.growing_windows import grown_starts, grows, tells_starts, told_starts
 from sipe_bayes.likelihood.noise import Noise, whiten
@@ -31,6 +31,7 @@ _NARROW, _FEW_DRAWS = 0.05, 16  # sd of the cube to which the band is to first o
 _SHORTER = (1.0, 0.5, 0.2, 0.05)  # steps of the starts that are tried, the next where one led uphill
 _SETTLED = 1e-3  # of the sum of squares: a step of the starts that gained less was the last
 _ITERATIONS = 4  # in which starts are looked for
+_AT_LIMIT = 1e-3  # relative: so near to it a correlation time is the longest that may be
 _PIECES = 10  # of a log: errors of neighbouring samples are not independent, of tenths nearly so
 
 
@@ -209,6 +210,13 @@ def fitted_units(windows: Windows) -> list[str]:
     """The units of the fitted channels, empty where the environment tells none."""
     units = getattr(windows.simulator.environment, "channel_units", None)
     return ["" if units is None else units[c] for c in windows.channels]
+
+
+def channel_noise(windows: Windows, noise: Noise) -> dict[str, ChannelNoise]:
+    """The noise of each fitted channel."""
+    at_limit = noise.tau >= (1 - _AT_LIMIT) * windows.trajectories.longest
+    rows = zip(noise.sd.tolist(), noise.tau.tolist(), fitted_units(windows), at_limit.tolist(), strict=True)
+    return {channel: ChannelNoise(*row) for channel, row in zip(windows.fitted, rows, strict=True)}
 
 
 def channel_scores(windows: Windows, theta: FloatArray, predicted: FloatArray | None = None) -> list[ChannelScore]:

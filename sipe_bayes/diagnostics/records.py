@@ -270,11 +270,19 @@ class Misfit:
 
 @dataclass(frozen=True)
 class ChannelNoise:
-    """Sensor noise of one channel: its sd in ``unit``, its correlation time ``tau`` in s (0: white)."""
+    """Sensor noise of one channel.
+
+    Args:
+        sd: in ``unit``.
+        tau: correlation time in s; 0 where it is white.
+        unit: of the channel.
+        tau_at_limit: whether ``tau`` is the longest that the logs can tell, their length: it may be longer.
+    """
 
     sd: float
     tau: float
     unit: str = ""
+    tau_at_limit: bool = False
 
 
 @dataclass(frozen=True)
@@ -340,6 +348,7 @@ class LogReport:
         resampled: whether samples were interpolated.
         gaps: (start, stop) in s from the trajectory's first sample, without a measurement for longer than ``max_gap``.
         missing: masked samples of each channel.
+        wild: samples of each channel left out at reading or by the fit, since no smooth motion explains them.
         clipped: samples of each channel and command (``actuator:NAME``) in runs at its extreme value.
         findings: the same in words, with what the user should know.
     """
@@ -354,6 +363,7 @@ class LogReport:
     resampled: bool
     gaps: tuple[tuple[float, float], ...] = ()
     missing: Mapping[str, int] = field(default_factory=dict)
+    wild: Mapping[str, int] = field(default_factory=dict)
     clipped: Mapping[str, int] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
 

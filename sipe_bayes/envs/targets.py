@@ -22,7 +22,7 @@ from sipe_bayes.envs.inertia import body_frame_inertia
 from sipe_bayes.envs.internal.elastic import ELASTIC, NUMBERS, motor_side, realise
 from sipe_bayes.envs.laws.base import SINGLE, Number
 from sipe_bayes.envs.laws.registry import LAW_OF
-from sipe_bayes.envs.target import Check, Maker, Target, TargetError, entry, named
+from sipe_bayes.envs.target import Check, Maker, Target, TargetError, actuator_unit, entry, named
 
 _PATTERN = re.compile(r"^(?:(body|joint|actuator|geom|pair):(.+)|(option))\.([a-z0-9_]+)$")
 _AXES = ("x", "y", "z")
@@ -54,7 +54,8 @@ def bind(model: mujoco.MjModel, spec: str) -> Target:
         index = 0 if kind == "option" else pair_index(model, name, spec)
     else:
         index = named(model, kind, name, f"target {spec!r}")
-    return legal[attribute](model, spec, index)
+    target = legal[attribute](model, spec, index)
+    return replace(target, unit=actuator_unit(model, index, target.unit)) if kind == "actuator" else target
 
 
 def _hinge(model: mujoco.MjModel, joint: int) -> bool:

@@ -36,11 +36,11 @@ class ProgressBar:
         self._bar: Any = None
         self._unit, self._counted = unit, counted
         self._began = self._last = time.monotonic()
-        self._first = self._before = (0, 0)  # what was done, and of how much, when this count began and last
-        self._since = self._began  # when it began
+        self._first, self._before = 0, (0, 0)  # what was done when this count began; and last, of how much
+        self._since: float | None = None  # when it began
         seen = "ipykernel" in sys.modules or sys.stderr.isatty()
         self._lines = not quiet and not seen
-        self._latest: tuple[str, int, int] | None = None
+        self._latest: tuple[str, int, int, int | None] | None = None
         self._lock, self._over = threading.Lock(), threading.Event()
         self._beat: threading.Thread | None = None
         if not quiet and seen:
@@ -68,18 +68,26 @@ class ProgressBar:
             self._bar.close()
             self._bar = None
 
-    def __call__(self, what: str, done: int, total: int) -> None:
-        """Say what is being done, and how much of all is done."""
+    def __call__(self, what: str, done: int, total: int, usual: int | None = None) -> None:
+        """Say what is being done, and how much of all is done.
+
+        Args:
+            what: is being done.
+            done: of the total.
+            total: the most that may be needed.
+            usual: what is needed as a rule, by which the rest is foretold; default the total.
+        """
         if self._bar is not None:
             self._bar.set_description(what, refresh=False)
-            self._bar.total, self._bar.n = total, min(done, total)
+            shown = total if usual is None else min(max(usual, done), total)
+            self._bar.total, self._bar.n = shown, min(done, shown)
             self._bar.refresh()
         elif self._lines:
-            self._latest = what, done, total
+            self._latest = what, done, total, usual
             if self._beat is None and not self._over.is_set():
                 self._beat = threading.Thread(target=self._go_on, daemon=True)
                 self._beat.start()
-            self._print(what, done, total)
+            self._print(what, done, total, usual)
 
     def _go_on(self) -> None:
         """Say again what is being done, until the end."""
@@ -87,28 +95,35 @@ class ProgressBar:
             assert self._latest is not None
             self._print(*self._latest)
 
-    def _print(self, what: str, done: int, total: int) -> None:
+    def _print(self, what: str, done: int, total: int, usual: int | None) -> None:
         with self._lock:
-            self._print_line(what, done, total)
+            self._print_line(what, done, total, usual)
 
-    def _print_line(self, what: str, done: int, total: int) -> None:
+    def _print_line(self, what: str, done: int, total: int, usual: int | None) -> None:
         now = time.monotonic()
-        if total != self._before[1] or done < self._before[0]:  # another count
-            self._first, self._since = (done, total), now
+        other = done < self._before[0] or (usual is None and total != self._before[1])
+        if self._since is None or other:  # another count
+            self._first, self._since = done, now
         self._before = (done, total)
         if now - self._last >= _SECONDS:
             self._last = now
-            print(self._line(what, done, total), file=sys.stderr, flush=True)
+            print(self._line(what, done, total, usual), file=sys.stderr, flush=True)
 
-    def _line(self, what: str, done: int, total: int) -> str:
+    def _line(self, what: str, done: int, total: int, usual: int | None) -> str:
         """The time until now, what is being done, and unless all is done how far and how long the rest may take."""
         line = f"{self._last - self._began:.0f} s: {what}"
         if done >= total or not self._counted:
             return line
-        line += f"; {done} of at most {total} {self._unit}"
-        own = done - self._first[0]  # not what an earlier run did
-        rest = _spoken((self._last - self._since) * (total - done) / own) if own else ""
-        return f"{line}, about {rest} for the rest if all are needed" if own else line
+        expected = total if usual is None else min(usual, total)
+        if done >= expected:
+            return f"{line}; {done} of at most {total} {self._unit}, more than usual"
+        most = expected == total
+        line += f"; {done} of {'at most' if most else 'about'} {expected} {self._unit}"
+        own = done - self._first  # not what an earlier run did
+        if own:
+            seconds = (self._last - (self._since or self._last)) * (expected - done) / own
+            line += f", about {_spoken(seconds)} for the rest" + " if all are needed" * most
+        return line if most else f"{line} (at most {total})"
 
 
 def _spoken(seconds: float) -> str:

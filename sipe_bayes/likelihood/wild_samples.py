@@ -1,4 +1,4 @@
-"""Samples that no motion passes through: glitches of an encoder, packets that were lost, flips of a motion capture.
+"""Samples that no smooth motion explains: glitches of an encoder, packets that were lost, flips of a motion capture.
 
 A position goes on from sample to sample as it does around; a wild sample jumps away and comes back. One far off counts
 in a sum of squares as much as thousands of good ones, so such samples are masked, in two stages:

@@ -23,7 +23,7 @@ from sipe_bayes.core.findings import Code, Finding, Findings, Severity
 from sipe_bayes.core.html import Page
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.thresholds import THRESHOLDS
-from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, LogReport, Mixing, improvement
+from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, LogReport, Mixing, improvement
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.report import calibration_plots as plots
 from sipe_bayes.report.drawing import inside_page, png, uncollected
@@ -31,7 +31,7 @@ from sipe_bayes.report.interactive.charts import charts
 from sipe_bayes.report.interactive.clips import Clip
 from sipe_bayes.report.templates import html_templates
 from sipe_bayes.report.verdicts import lacking, parameter_verdict, verdicts
-from sipe_bayes.report.words import error_text, number, significant, times, unit_text
+from sipe_bayes.report.words import correlation_time, error_text, number, significant, times, unit_text
 
 _GAPS = 4  # that a row of the logs lists
 _DRAWN = 4  # logs whose signals are drawn, half of them held out, where there are more: a panel takes .1 s
@@ -100,8 +100,16 @@ def _score_row(score: ChannelScore) -> dict[str, str]:
 
 
 def _noise_row(channel: str, noise: ChannelNoise) -> dict[str, str]:
-    correlated = "white" if noise.tau == 0 else f"{number(noise.tau)} s"
-    return {"channel": channel, "sd": number(noise.sd), "unit": unit_text(noise.unit), "tau": correlated}
+    size = {"sd": number(noise.sd), "unit": unit_text(noise.unit)}
+    return {"channel": channel, **size, "tau": correlation_time(noise)}
+
+
+def _compared(comparison: Comparison | None) -> str:
+    """Why the ratio at the top is none of those in the table."""
+    if comparison is None:
+        return ""
+    text = "Each row is one channel of one log; the ratio at the top is the geometric mean over all that are held out"
+    return f"{text}, from starts that each model fits." if comparison.starts is not None else f"{text}."
 
 
 def _counts(counts: Mapping[str, int]) -> str:
@@ -120,6 +128,7 @@ def _log_row(log: LogReport, use: str) -> dict[str, object]:
         "resampled": "yes" if log.resampled else "no",
         "gaps": spans + (f" and {len(log.gaps) - _GAPS} more" if len(log.gaps) > _GAPS else "") or "none",
         "missing": _counts(log.missing),
+        "wild": _counts(log.wild),
         "clipped": _counts(log.clipped),
         "notes": log.notes,
     }
@@ -221,6 +230,7 @@ def _context(calibration: Calibration, images: Sequence[Picture], clip: Clip | N
             ("Held-out logs", [_score_row(s) for s in calibration.holdout]),
             ("Training logs", [_score_row(s) for s in calibration.train]),
         ],
+        "compared": _compared(calibration.comparison),
         "ridges": [ridge.text for ridge in calibration.ridges],
         "left_out": calibration.left_out,
         "sections": sections,

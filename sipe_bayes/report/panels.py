@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -336,7 +337,8 @@ def _axis_name(parameter: Parameter, length: int) -> str:
     """Name, log of a nuisance parameter and unit, each on lines of its own."""
     name, bracket, log = parameter.name.partition("[")
     unit = unit_text(parameter.unit)
-    parts = [_wrapped(name, length), _wrapped(bracket + log, length), f"[{unit}]" if unit else ""]
+    bracketed = textwrap.wrap(f"[{unit}]", length) if unit else []
+    parts = [_wrapped(name, length), _wrapped(bracket + log, length), *bracketed]
     return "\n".join(part for part in parts if part)
 
 

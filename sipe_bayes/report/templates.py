@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import jinja2
+from markupsafe import Markup, escape
 
 
 def html_templates(*packages: str) -> jinja2.Environment:
@@ -13,13 +14,20 @@ def html_templates(*packages: str) -> jinja2.Environment:
     Args:
         *packages: whose folders of templates are looked through, in order.
     """
-    return jinja2.Environment(
+    environment = jinja2.Environment(
         loader=jinja2.ChoiceLoader([jinja2.PackageLoader(package, "templates") for package in packages]),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["breakable"] = breakable
+    return environment
+
+
+def breakable(name: str) -> Markup:
+    """A name for HTML that may be broken into lines after its underscores."""
+    return Markup("_<wbr>").join(escape(part) for part in name.split("_"))
 
 
 def latex_templates(package: str, escape: Callable[[object], str]) -> jinja2.Environment:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.units import UNITS
+from sipe_bayes.diagnostics.records import ChannelNoise
 
 _PER = {"command": "unit of command", "position": "rad or m", "velocity": "rad/s or m/s"}  # of an actuator's numbers
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -59,6 +60,14 @@ def times(ratio: float) -> str:
     return f"{factor:.1f} times {word}" if factor < 9.95 else f"{number(factor, 2)} times {word}"
 
 
+def correlation_time(noise: ChannelNoise) -> str:
+    """How long noise remembers, in words; where it is at its limit, that it is."""
+    if not noise.tau:
+        return "white"
+    text = f"{number(noise.tau)} s"
+    return f"{text} or more (as long as the logs)" if noise.tau_at_limit else text
+
+
 def listed(names: Sequence[str]) -> str:
     """The names as words of a sentence: "a, b and c"."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}" if names else ""
@@ -67,8 +76,9 @@ def listed(names: Sequence[str]) -> str:
 def unit_text(unit: str) -> str:
     """``unit`` for the eye: "kg m^2" with a raised 2, nothing for the unit "1", of an actuator what it may be."""
     of, per, by = unit.partition("/")
-    if of == "force":
-        return f"N or N m{f' per {_PER.get(by, by)}' if per else ''}"
+    if of == "force" or by == "command":
+        top = "N or N m" if of == "force" else of
+        return f"{top} per {_PER.get(by, by)}" if per else top
     return "" if unit == "1" else re.sub(r"\^(-?\d+)", lambda power: power[1].translate(_RAISED), unit)
 
 

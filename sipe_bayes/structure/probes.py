@@ -146,9 +146,9 @@ def _size(change: FloatArray) -> FloatArray:
 def _named(effect: Effect) -> list[Probe]:
     placed = effect.placed
     targets = [target for parameter in placed.parameters for target in parameter.targets]
-    what = "a parameter" if len(targets) == 1 else "parameters"
+    what = "as a parameter (or widen its bounds)" if len(targets) == 1 else "as parameters (or widen their bounds)"
     by_log = any(parameter.log is not None for parameter in placed.parameters)
-    remedy = f"make {' and '.join(targets)} {what} (or widen its bounds)"
+    remedy = f"add {' and '.join(targets)} {what}"
     probe = Probe(placed.sentence, remedy, by_log, placed.site, placed.extension)
     if effect.trades.any():
         sized = effect.trades / np.sqrt(_size(effect.change))[:, None]

@@ -132,6 +132,8 @@ WRONG: list[tuple[str, str, str]] = [
     ("window = 0.5", "window = 0.5\nestimator = 'laplac'", "`estimator`: .*'laplac'; did you mean 'laplace'"),
     ("window = 0.5", "window = 0.5\nseed = -1", "`seed`: .*got -1"),
     ("window = 0.5", "window = 0.5\nbudget = 0", "`budget`: .*greater than 0, got 0"),
+    ("window = 0.5", "window = 0.5\ngeometry_tolerance = 2", "`geometry_tolerance`: .*got 2; give one such as 0.05"),
+    ('"a.csv"', '"a.csv"\ngeometry_tolerance = 0.1', r"`logs\[0\].geometry_tolerance`: .*above the first line with \["),
     ("window = 0.5", "windw = 0.5", "`windw`: unknown key; did you mean 'window'"),
     ("window = 0.5", "window = 0.5 s", "not valid TOML"),
     ('"ms"', '"msec"', "`columns.time.unit`: .*got 'msec'; did you mean 'ms'"),

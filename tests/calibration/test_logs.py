@@ -1,6 +1,9 @@
 """Reading logs: formats, the control grid, masking, and what is said of them."""
 
+import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -9,12 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from sipe_bayes.calibration.checks.fitted import with_wild
 from sipe_bayes.calibration.config import load_config
 from sipe_bayes.calibration.config_fields import ConfigError
 from sipe_bayes.calibration.log_report import count_clipped
 from sipe_bayes.calibration.logs import load_log
+from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.calibration.readers.base import LogError
 from sipe_bayes.calibration.readers.tables import read_table
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference.laplace.estimator import Laplace
 from tests.problems.log_tables import EXAMPLES, FAST, QUIET, TOML, configure, load, regular, write
 
 finite = st.floats(-1e6, 1e6, allow_subnormal=False)
@@ -294,3 +301,24 @@ def test_a_sensor_that_is_slower_than_the_log_misses_nothing(tmp_path: Path) -> 
     _, report = load(tmp_path, {"t": t, "q": q, "u": t})
     assert report.missing["q"] == np.isnan(q).sum()
     assert report.suspect
+
+
+def test_samples_left_out_as_wild_are_counted(tmp_path: Path) -> None:
+    columns = {"t": np.arange(400) * 0.01, "u": np.zeros(400), "q": np.sin(np.arange(400) * 0.02)}
+    assert load(tmp_path, columns)[1].wild == {}
+    columns["q"][[100, 250]] += 20.0
+    report = load(tmp_path, columns)[1]
+    assert report.wild == {"q": 2}
+    assert any("no smooth motion" in note for note in report.notes)
+
+
+def test_samples_that_the_fit_left_out_are_counted_with_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    trajectory, report = load(tmp_path, regular())
+    problem = SimpleNamespace(
+        reports=(dataclasses.replace(report, wild={"q": 2}),),
+        train=Trajectories.stack([trajectory]),
+        environment=SimpleNamespace(channels=("q",)),
+    )
+    monkeypatch.setattr(Laplace, "wild", np.array([[0, 5, 0], [0, 6, 0], [0, 7, 0]]))
+    (counted,) = with_wild(cast(Problem, problem), Laplace.__new__(Laplace))
+    assert counted.wild == {"q": 5}

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from safetensors import safe_open
 from typer.testing import CliRunner
 
@@ -118,6 +119,8 @@ def test_posterior_is_read_back(finished: tuple[Path, Path, Any]) -> None:
     for name, p in found.items():
         draws = data.posterior[name].values
         assert abs(draws.mean() - p["mean"]) < 6 * p["sd"] / np.sqrt(draws.size)
+    again = posterior.netcdf(torch.Generator().manual_seed(0))
+    assert again == (out / "posterior.nc").read_bytes(), "the same draws each time"
 
 
 def test_identified_model_carries_the_mode(finished: tuple[Path, Path, Any]) -> None:

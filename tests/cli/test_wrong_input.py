@@ -44,12 +44,12 @@ WRONG: dict[str, tuple[Callable[[Path], None], list[str], list[str]]] = {
     "missing column": (
         table(lambda log: log.rename(columns={"position": "positn"})),
         [],
-        ["log 'log'", "no column 'position'", "did you mean 'positn'?"],
+        ["log 'log'", "`measurements[0].column`: no column 'position'", "did you mean 'positn'?"],
     ),
     "missing clock": (
         text("[noise]", '[columns]\ntime = { column = "tome" }\n\n[noise]'),
         [],
-        ["log 'log'", "no column 'tome'", "did you mean 'time'?"],
+        ["log 'log'", "`columns.time.column`: no column 'tome'", "did you mean 'time'?"],
     ),
     "unknown joint": (text("joint:hinge.pos", "joint:hing.pos"), [], ["'angle'", "no joint 'hing'", "'hinge'?"]),
     "unknown actuator": (text('"motor"', '"moter"'), [], ["no actuator 'moter'", "did you mean 'motor'?"]),

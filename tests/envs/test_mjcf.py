@@ -60,7 +60,7 @@ def test_units_defaults_and_columns_come_from_the_model() -> None:
             "sensor:tacho[0]",
         ),
     )
-    assert environment.space.units == ("kg", "mN m s/rad", "force/position")
+    assert environment.space.units == ("kg", "mN m s/rad", "N/m")
     assert [q.default for q in environment.space] == [1.0, 0.1, 10.0]
     assert environment.channels[:2] == ("joint:hinge.position", "bob speed")
     assert environment.channel_units == ("rad", "m/s", "rad", "m/s^2", "m/s")

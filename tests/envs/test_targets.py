@@ -147,7 +147,7 @@ def give_way(spec: Any) -> None:
 
 TWIST = "hinge2.link"
 HINGE = {"force": "N m", "velocity": "rad/s", "position": "rad"}  # a unit in words as it is at a hinge
-HINGE |= {"force/velocity": "N m/(rad/s)", "position/force": "rad/(N m)"}
+HINGE |= {"force/velocity": "N m/(rad/s)", "position/force": "rad/(N m)", "1/force": "1/(N m)"}
 LAW_AT = {"joint": "joint:hinge", "actuator": "actuator:motor"}
 
 # (target, value, unit, how the spec is edited)
@@ -184,19 +184,19 @@ CASES: list[tuple[str, float, str, Edit]] = [
     ("joint:hinge.stiffness_cubic", 4.0, "N m/(rad)^3", vector("stiffness", 2)),
     ("actuator:motor.gear", 3.0, "1", vector("gear", 0)),
     ("actuator:position.gear", 1.5, "1", vector("gear", 0)),
-    ("actuator:motor.gain", 2.5, "force/command", vector("gainprm", 0)),
-    ("actuator:position.kp", 20.0, "force/position", kp),
-    ("actuator:position.kv", 3.0, "force/velocity", actuator(2, -1)),
-    ("actuator:motor.kv", 0.5, "force/velocity", actuator(2, -1)),
-    ("actuator:motor.bias_force", 0.4, "force", actuator(0)),
-    ("actuator:general.bias_position", -2.0, "force/position", actuator(1)),
-    ("actuator:motor.bias_velocity", -0.1, "force/velocity", actuator(2)),
+    ("actuator:motor.gain", 2.5, "N m/command", vector("gainprm", 0)),
+    ("actuator:position.kp", 20.0, "N/m", kp),
+    ("actuator:position.kv", 3.0, "N s/m", actuator(2, -1)),
+    ("actuator:motor.kv", 0.5, "N m s/rad", actuator(2, -1)),
+    ("actuator:motor.bias_force", 0.4, "N m", actuator(0)),
+    ("actuator:general.bias_position", -2.0, "N m/rad", actuator(1)),
+    ("actuator:motor.bias_velocity", -0.1, "N m s/rad", actuator(2)),
     ("actuator:motor.offset", 0.2, "command", offset),
     ("actuator:late.delay", 0.01, "s", scalar("delay")),
-    ("actuator:weak.force_limit", 2.0, "force", limit),
-    ("actuator:wary.command_limit", 0.4, "command", command_limit),
+    ("actuator:weak.force_limit", 2.0, "N m", limit),
+    ("actuator:wary.command_limit", 0.4, "rad", command_limit),
     ("actuator:slow.lag", 0.05, "s", vector("dynprm", 0)),
-    ("actuator:pid.kp", 4.0, "force/position", actuator(1, -1)),
+    ("actuator:pid.kp", 4.0, "N m/rad", actuator(1, -1)),
     *((target, value, unit, vector(field, slot)) for target, value, unit, field, slot in motors.CASES),
     ("geom:box.friction", 0.3, "1", vector("friction", 0)),
     ("geom:box.friction_torsional", 0.01, "m", vector("friction", 1)),

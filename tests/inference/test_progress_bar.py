@@ -102,3 +102,26 @@ def test_silence(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_notebook(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ipykernel", sys)
     assert "start 1 of 3:  25%" in shown(monkeypatch, io.StringIO())
+
+
+def test_what_is_usual_is_foretold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside the most that may be needed; and a total that shrinks between is the same count."""
+    clock, stream = Clock(), io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr("sipe_bayes.inference.progress_bar.time", clock)
+    with sipe.ProgressBar() as progress:
+        for done, total, usual in ((0, 1000, 300), (100, 1000, 300), (200, 500, 250), (260, 500, 250)):
+            progress("fitting", done, total, usual)
+            clock.now += 15
+    first, second, last = stream.getvalue().splitlines()
+    assert first.endswith("100 of about 300 rollouts, about 30 s for the rest (at most 1000)")
+    assert second.endswith("200 of about 250 rollouts, about 8 s for the rest (at most 500)")
+    assert last.endswith("260 of at most 500 rollouts, more than usual")
+
+
+def test_a_bar_is_full_where_what_is_usual_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = Terminal()
+    monkeypatch.setattr(sys, "stderr", stream)
+    with sipe.ProgressBar() as progress:
+        progress("fitting", 20, 400, 80)
+    assert "20/80" in stream.getvalue()

@@ -6,7 +6,7 @@ MOTORS = """<pid name="pid" joint="hinge2" input="pos" kp="2" kv=".1" ki="3"/>
 
 # (target, value, unit, field, slot)
 CASES = [
-    ("actuator:pid.ki", 4.0, "force/(position s)", "gainprm", 0),
+    ("actuator:pid.ki", 4.0, "N m/(rad s)", "gainprm", 0),
     ("actuator:drive.resistance", 3.0, "Ohm", "gainprm", 0),
     ("actuator:drive.motor_constant", 0.4, "N m/A", "gainprm", 1),
     ("actuator:drive.kp", 4.0, "N m/rad", "gainprm", 4),

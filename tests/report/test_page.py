@@ -77,6 +77,12 @@ def test_page_says_what_matters_first(page: str) -> None:
     assert "Left out." not in text
 
 
+def test_the_table_of_logs_counts_wild_samples(calibration: Calibration) -> None:
+    log = dataclasses.replace(calibration.logs[0], wild={"angle_0": 3})
+    text = Page(report.render(dataclasses.replace(calibration, logs=[log]), [])).text
+    assert text.index("left out as wild") < text.index("angle_0 3")
+
+
 def test_what_is_left_out_is_said(calibration: Calibration) -> None:
     text = Page(
         report.render(

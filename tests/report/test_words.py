@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from sipe_bayes.report.words import unit_text, with_unit
+from sipe_bayes.core.findings import Code, finding, singular
+from sipe_bayes.diagnostics.records import ChannelNoise
+from sipe_bayes.report.templates import breakable
+from sipe_bayes.report.words import correlation_time, unit_text, with_unit
 
 
 @pytest.mark.parametrize(
@@ -33,9 +36,39 @@ def test_one_unit_stands_beside_a_name(name: str, unit: str, text: str) -> None:
         ("rad/s", "rad/s"),
         ("force", "N or N m"),
         ("force/command", "N or N m per unit of command"),
+        ("N m/command", "N m per unit of command"),
         ("force/velocity", "N or N m per rad/s or m/s"),
         ("force/(position s)", "N or N m per (position s)"),
     ],
 )
 def test_a_unit_says_what_it_may_be(unit: str, text: str) -> None:
     assert unit_text(unit) == text
+
+
+@pytest.mark.parametrize(
+    ("noise", "text"),
+    [
+        (ChannelNoise(0.1, 0.0), "white"),
+        (ChannelNoise(0.1, 0.25), "0.25 s"),
+        (ChannelNoise(0.1, 12.0, tau_at_limit=True), "12 s or more (as long as the logs)"),
+    ],
+)
+def test_a_correlation_time_at_its_limit_is_not_told_as_if_it_were_measured(noise: ChannelNoise, text: str) -> None:
+    assert correlation_time(noise) == text
+
+
+def test_names_break_at_underscores_and_are_escaped() -> None:
+    assert breakable("pan_drive_kv") == "pan_<wbr>drive_<wbr>kv"
+    assert breakable("a<b_c") == "a&lt;b_<wbr>c"
+
+
+@pytest.mark.parametrize(
+    ("text", "one"),
+    [
+        ("1 samples in 1 logs", "1 sample in 1 log"),
+        ("1 of 21 samples, 0.1 samples, 11 logs", "1 of 21 samples, 0.1 samples, 11 logs"),
+    ],
+)
+def test_one_is_one(text: str, one: str) -> None:
+    assert singular(text) == one
+    assert "q: 1 sample masked" in finding(Code.LOG_WILD, channel="q", count=1).text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,8 +14,8 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.agreement import LogEstimates, disagreement, linear_estimates, log_estimates, parts_of
-from sipe_bayes.diagnostics.evaluate import best_starts, fitted_units, white_noise
-from sipe_bayes.diagnostics.records import ChannelNoise
+from sipe_bayes.diagnostics.evaluate import best_starts, channel_noise, white_noise
+from sipe_bayes.diagnostics.records import ChannelNoise, LogReport
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.windows.growing_windows import grows
@@ -38,6 +39,16 @@ def tamed(logs: Trajectories, method: Estimator) -> Trajectories:
     observations = logs.observations.copy()
     observations[tuple(method.wild.T)] = np.nan
     return replace(logs, observations=observations)
+
+
+def with_wild(problem: Problem, method: Estimator) -> list[LogReport]:
+    """What the logs held, with the samples that the fit left out."""
+    if not isinstance(method, Laplace):
+        return list(problem.reports)
+    counts = {report.name: Counter(report.wild) for report in problem.reports}
+    for log, _, channel in method.wild:
+        counts[problem.train.names[log]][problem.environment.channels[channel]] += 1
+    return [replace(report, wild=dict(counts[report.name])) for report in problem.reports]
 
 
 @dataclass(frozen=True)
@@ -86,8 +97,7 @@ class Fit:
 
     def channel_noise(self) -> dict[str, ChannelNoise]:
         """Of each fitted channel."""
-        rows = zip(self.noise.sd.tolist(), self.noise.tau.tolist(), fitted_units(self.windows), strict=True)
-        return {channel: ChannelNoise(*row) for channel, row in zip(self.windows.fitted, rows, strict=True)}
+        return channel_noise(self.windows, self.noise)
 
 
 def _noise_of(method: Estimator, windows: Windows, theta: FloatArray) -> Noise:

@@ -68,7 +68,7 @@ def episode(table: Columns, numbers: IntArray, number: int) -> Columns:
 def episode_numbers(path: Path, table: Columns, column: str) -> IntArray:
     """The number of the episode that each row (n,) is of; raises LogError where a column holds none."""
     if column not in table:
-        raise LogError(f"{path}: no column {column!r}; {nearest(column, table)}")
+        raise LogError(f"{path}: key `columns.episode`: no column {column!r}; {nearest(column, table)}")
     try:
         values = np.asarray(table[column], dtype=np.float64)
     except (TypeError, ValueError, OverflowError):

@@ -93,14 +93,14 @@ class Laplace(Estimator[LaplaceState]):
 
     def budget_for(self, trajectories: Trajectories) -> int:
         """So many that each starting point may be followed to the end: it grows with logs and unknowns."""
-        each = _STEPS * (len(self.space) + self._num_start + _TRIALS)
+        each = _STEPS * (len(self.space) + self.num_start + _TRIALS)
         if isinstance(self.likelihood, StateSpace):
             each += draws_size(len(self.space), self.problem) + linearisations_cost(self.problem, self._coordinates)
-            each += self.options.tuning.state_space.shooting.all_room if self._num_start else 0
+            each += self.options.tuning.state_space.shooting.all_room if self.num_start else 0
         return max(self.default_budget, each * len(trajectories))
 
     @property
-    def _num_start(self) -> int:
+    def num_start(self) -> int:
         """D, unknowns of a start."""
         return 0 if self.likelihood.starts == "recorded" else self._coordinates
 

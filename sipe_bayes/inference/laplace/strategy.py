@@ -149,7 +149,8 @@ class StrategyState(Generic[P]):
 
     def describe(self) -> str:
         """Starting point and step, for the progress bar."""
-        return f"start {self.point + 1} of {len(self.points)}, step {self.here.iteration}"
+        of = f" of at least {len(self.points)}" * (len(self.points) > 1)  # the search may come upon more
+        return f"start {self.point + 1}{of}, step {self.here.iteration}"
 
     def at(self, here: P) -> Self:
         """The search at another position."""

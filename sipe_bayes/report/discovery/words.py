@@ -8,7 +8,7 @@ from sipe_bayes.core.findings import Code, Findings
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors, Piece
 from sipe_bayes.report.verdicts import Verdict
-from sipe_bayes.report.words import error_text, listed, number, significant, unit_text
+from sipe_bayes.report.words import correlation_time, error_text, listed, significant, unit_text
 from sipe_bayes.structure.structures import StructureRow
 
 _SURE = 0.995  # a probability from which no more digits are told
@@ -193,7 +193,7 @@ def residual_lines(discovery: Discovery) -> list[str]:
     for channel, before in discovery.before.noise.items():
         after = discovery.after.noise[channel]
         sizes = " to ".join(error_text(noise.sd) for noise in (before, after))
-        times = " to ".join(f"{number(noise.tau)} s" for noise in (before, after))
+        times = " to ".join(correlation_time(noise) for noise in (before, after))
         lines.append(f"{channel}: sd from {sizes} {unit_text(after.unit)}, correlation time from {times}")
     return lines
 

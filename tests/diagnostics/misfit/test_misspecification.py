@@ -78,7 +78,7 @@ def test_the_shift_is_how_far_the_estimate_moves_when_the_cause_is_modelled() ->
     seen = found(recorded)
     print(seen.text, moved)
     assert seen.cause == "an offset of motor"
-    assert "make actuator:motor.offset a parameter" in seen.text
+    assert "add actuator:motor.offset as a parameter" in seen.text
     (before, sd), (after, _) = moved
     told = np.array(list(seen.shift.values()))
     assert np.abs(told - (after - before) / sd).max() < 0.3 * np.abs(told).max()

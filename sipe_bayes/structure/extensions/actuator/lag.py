@@ -34,7 +34,7 @@ class FilteredCommand:
         for name in self.actuators:
             actuator = spec.actuator(name)
             if int(actuator.dyntype) != int(mujoco.mjtDyn.mjDYN_NONE):
-                raise ValueError(f"actuator {name!r}: has dynamics of its own; make its lag a parameter")
+                raise ValueError(f"actuator {name!r}: has dynamics of its own; add its lag as a parameter")
             actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, True
             actuator.dynprm = np.zeros(len(actuator.dynprm))
             declare_start(spec, f"actuator:{name}", [self.unsettled])
