@@ -1,59 +1,30 @@
-"""What a search decided by a hair: pieces that did about as well as the kept one in the round that chose between them.
+"""What might stand in a kept piece's place: pieces that promise about as much once all else that is kept is there.
 
-A round compares pieces while all that is kept later is still missing, so a close one need not be the right one. In the
-whole structure each is put in the other's place once, and the evidence of the whole decides.
+A round chooses while all that is kept later is still missing: one that then fell behind, or was not fitted at all,
+because others promised a little more, may be the right one. So each kept piece is left out once more, what is left is
+asked anew what it lacks, and the evidence of the whole structures decides.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
-from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.structure.fitted import FittedStructure
-
-
-@dataclass(frozen=True)
-class Rival:
-    """A kept piece with another in its place.
-
-    Args:
-        labels: of the structure with the other one.
-        kept: label that it takes the place of.
-        theta: (P,) of the other one's parameters, where its round had them.
-    """
-
-    labels: tuple[str, ...]
-    kept: str
-    theta: FloatArray
+from sipe_bayes.structure.state import Offer
 
 
 def rivals(
-    fitted: Sequence[FittedStructure],
-    present: Sequence[str],
-    total: Callable[[FittedStructure], float],
-    share: float,
-    most: int,
-) -> Iterator[Rival]:
-    """The rivals of each piece of a structure, the best ``most`` of them for each.
+    offers: Sequence[Offer], without: Sequence[str], whole: Sequence[str], share: float, most: int
+) -> list[Offer]:
+    """The rivals of a kept piece, the best ``most`` of them, best first.
 
     Args:
-        fitted: every structure of the search.
-        present: labels of the structure, in the order in which they were kept.
-        total: log posterior of a structure up to a constant.
-        share: of the kept piece's gain by which another may fall behind.
-        most: rivals of one piece.
+        offers: all that was promised in the search.
+        without: labels of the structure without the piece.
+        whole: labels of the structure with it.
+        share: of the piece's own promise there, by which a rival's may fall behind.
+        most: rivals.
     """
-    known = {frozenset(one.labels): one for one in fitted}
-    for k, kept in enumerate(present):
-        before = frozenset(present[:k])
-        here, chosen = known.get(before), known.get(before | {kept})
-        if here is None or chosen is None:
-            continue
-        least = total(here) + (1 - share) * (total(chosen) - total(here))
-        mates = [one for one in fitted if len(one.labels) == k + 1 and before < set(one.labels)]
-        close = [one for one in mates if not set(one.labels) - before <= set(present) and total(one) > least]
-        for one in sorted(close, key=total, reverse=True)[:most]:
-            (label,) = set(one.labels) - before
-            labels = tuple(label if x == kept else x for x in present)
-            yield Rival(labels, kept, one.theta[len(here.theta) :])
+    there = {offer.label: offer for offer in offers if set(offer.at) == set(without)}  # the last of each
+    own = max((offer.gain for label, offer in there.items() if label in whole), default=0.0)
+    close = [o for label, o in there.items() if label not in whole and o.gain > 0 and o.gain >= (1 - share) * own]
+    return sorted(close, key=lambda offer: -offer.gain)[:most]

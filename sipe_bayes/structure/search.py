@@ -11,7 +11,7 @@ r"""The search over structures: what promises most is fitted, the best is kept, 
       v                                                      v
     FIT     the best few, one a step ------------------>  PRUNE   each kept piece left out once
       |  the best of them is better                           v
-      v                                                    SWAP   what did about as well, in a kept one's place
+      v                                                    SWAP   what promises as much, in a kept one's place
     AGAIN   the present structure, from where the             v
       |     best one ended: still better, it is kept       RESIDUAL  a force without a name, as the yardstick
       +--> RANK                                               v
@@ -60,8 +60,8 @@ class DiscoverOptions(Options):
     tied: float = option(0.05, "of the best gain, within which candidates promise the same", least=0)
     most: int = option(5, "extensions that a structure may have", least=1)
     against: float = option(2.0, "nats of held-out logs that speak against an extension", "nats", least=0)
-    rivals: int = option(2, "of a kept piece that are tried in its place", least=0)
-    rival: float = option(0.1, "of a piece's gain in its round, by which a rival may fall behind", least=0)
+    rivals: int = option(3, "of a kept piece that are tried in its place", least=0)
+    rival: float = option(0.1, "of what a kept piece promises in its place, by which a rival may fall behind", least=0)
     least_gain: float = option(2.0, "promised gain beyond an extension's cost from which it is fitted", "nats", above=0)
     sparsity: float = option(1.0, "against any extension: a model is expected to lack exp(-1) pieces", "nats", least=0)
     gross: float = option(THRESHOLDS.gross, "of a channel's spread left from which signs and units are tried", least=0)
@@ -131,7 +131,7 @@ class StructureSearch:
             Phase.FIT: f"fitting {state.queue[0] if state.queue else ''}{having}",
             Phase.AGAIN: f"fitting without {state.larger[-1] if state.larger else ''} once more",
             Phase.PRUNE: "leaving out each piece once",
-            Phase.SWAP: "trying what did about as well in the place of what is kept",
+            Phase.SWAP: "trying what promises as much in the place of what is kept",
             Phase.RESIDUAL: "fitting a force without a name",
             Phase.DONE: "done",
         }[state.phase]
@@ -238,15 +238,13 @@ class StructureSearch:
     def _rank(self, state: DiscoverState) -> DiscoverState:
         if len(state.present) >= self.options.most:
             return replace(state, phase=Phase.PRUNE)
-        state, ranked = self._ranked(state, last_resort=False)
+        state, ranked = self._ranked(state, state.here, last_resort=False)
         if state.cut is not None:
             return state
-        offers = tuple(Offer(state.present, c.placed.label, c.gain, c.theta, c.others) for c in ranked)
         promising = [c for c in ranked if c.gain > self.cost + self.options.least_gain]
         untried = [c for c in promising if state.of([*state.present, c.placed.label]) is None]
         queue = tuple(c.placed.label for c in self._worth(untried))
-        phase = Phase.FIT if queue else Phase.PRUNE
-        return replace(state, offers=state.offers + offers, queue=queue, phase=phase)
+        return replace(state, queue=queue, phase=Phase.FIT if queue else Phase.PRUNE)
 
     def _worth(self, ranked: list[Candidate]) -> list[Candidate]:
         """The first few, and those that promise as much as the first: a linear promise does not decide between them."""
@@ -254,27 +252,27 @@ class StructureSearch:
         level = (1 - self.options.tied) * ranked[0].gain if ranked else 0.0
         return ranked[:width] + [c for c in ranked[width : 2 * width] if c.gain >= level]
 
-    def _ranked(self, state: DiscoverState, last_resort: bool) -> tuple[DiscoverState, list[Candidate]]:
-        """What the extensions promise, best first, and the state with what that took; cut where too little is left."""
-        here, fitting, own = state.here, self.fitting, self.structure(state.present)
+    def _ranked(
+        self, state: DiscoverState, here: FittedStructure, last_resort: bool
+    ) -> tuple[DiscoverState, list[Candidate]]:
+        """What extensions promise beside a structure, best first, and the state with it; cut where little is left."""
+        fitting, own = self.fitting, self.structure(here.labels)
         simulator = fitting.simulator(own)
         windows, prior = fitting.windows(simulator), QuadraticPrior.of(fitting.prior_of(simulator))
         targets = {t for p in own for q in p.parameters for t in q.targets}
-        rest = [
-            p
-            for p in self._placed.values()
-            if p.label not in here.labels
-            and p.extension.last_resort == last_resort
-            and not targets & {t for q in p.parameters for t in q.targets}
-        ]
-        if not rest:
-            return state, []
-        windows.budget = self._left(state)
+        rest = [p for p in self._placed.values() if p.extension.last_resort == last_resort]
+        rest = [p for p in rest if not targets & {t for q in p.parameters for t in q.targets}]
+        rest = [p for p in rest if p.label not in here.labels]
+        windows.budget, ranked, cut = self._left(state), list[Candidate](), None
         try:
-            ranked, cut = candidates(windows, here.theta, here.starts, here.noise, prior, rest, self._tell), None
+            if rest:
+                ranked = candidates(windows, here.theta, here.starts, here.noise, prior, rest, self._tell)
         except BudgetExhausted:
-            ranked, cut = [], state.phase
-        return replace(state, rank_rollouts=state.rank_rollouts + windows.rollouts, cut=cut), ranked
+            cut = state.phase
+        offers = tuple(Offer(here.labels, c.placed.label, c.gain, c.theta, c.others) for c in ranked)
+        ranks = state.rank_rollouts + windows.rollouts
+        done = (*state.ranked, here.labels) if cut is None and not last_resort else state.ranked
+        return replace(state, offers=state.offers + offers, ranked=done, rank_rollouts=ranks, cut=cut), ranked
 
     def _left(self, state: DiscoverState) -> int:
         """Rollouts of the budget."""
@@ -354,17 +352,21 @@ class StructureSearch:
         return replace(state, phase=Phase.SWAP)
 
     def _swap(self, state: DiscoverState) -> DiscoverState:
-        """One structure with a close rival in a kept piece's place fitted, or all of them compared."""
+        """What is left without one kept piece ranked, one structure with a rival fitted, or all of them compared."""
         here, options = state.here, self.options
-        close = list(rivals(state.fitted, here.labels, self.total, options.rival, options.rivals))
-        for rival in close:
-            if state.of(rival.labels) is None and rival.labels not in state.failed:
-                owners = np.array(self._owners(here), object)
-                own = [here.theta[owners == label] for label in (None, *here.labels)]
-                own[1 + here.labels.index(rival.kept)] = rival.theta
-                return self._fitted(state, rival.labels, np.concatenate(own))
-        known = [one for rival in close if (one := state.of(rival.labels)) is not None]
-        best = max((one for one in known if not state.is_refused(one.labels)), key=self.total, default=here)
+        for kept in here.labels if options.rivals else ():
+            without = state.of([label for label in here.labels if label != kept])
+            if without is None:
+                continue
+            if without.labels not in state.ranked:
+                return self._ranked(state, without, last_resort=False)[0]
+            for offer in rivals(state.offers, without.labels, here.labels, options.rival, options.rivals):
+                labels = (*without.labels, offer.label)
+                if state.of(labels) is None and labels not in state.failed:
+                    return self._fitted(state, labels, np.concatenate([offer.others, offer.theta]))
+        own, close = set(here.labels), [one for one in state.fitted if len(one.labels) == len(here.labels)]
+        close = [one for one in close if len(own ^ set(one.labels)) == 2 and not state.is_refused(one.labels)]
+        best = max(close, key=self.total, default=here)
         if not self.better(best, here):
             return replace(state, phase=Phase.RESIDUAL)
         if self._speaks_against(state := self._judged(state, best), best):
@@ -372,11 +374,9 @@ class StructureSearch:
         return replace(state, present=best.labels)
 
     def _residual(self, state: DiscoverState) -> DiscoverState:
-        state, ranked = self._ranked(state, last_resort=True)
+        state, ranked = self._ranked(state, state.here, last_resort=True)
         if state.cut is not None:
             return state
-        offers = tuple(Offer(state.present, c.placed.label, c.gain, c.theta, c.others) for c in ranked)
-        state = replace(state, offers=state.offers + offers)
         if ranked and ranked[0].gain > self.cost + self.options.least_gain:
             labels = (*state.present, ranked[0].placed.label)
             state = self._fitted(state, labels, np.concatenate([state.here.theta, ranked[0].theta]))

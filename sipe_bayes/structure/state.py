@@ -70,6 +70,7 @@ class DiscoverState:
         present: labels of the structure that is gone on from.
         larger: labels of the structure that is better than it, while it is fitted again.
         offers: all that was promised until now.
+        ranked: labels of structures at which all extensions were asked what they promise.
         queue: labels of the extensions that this round still has to fit.
         failed: labels of structures that could not be fitted.
         columns: of the logs that are multiplied, since then the plain model fits far better.
@@ -87,6 +88,7 @@ class DiscoverState:
     present: tuple[str, ...] = ()
     larger: tuple[str, ...] = ()
     offers: tuple[Offer, ...] = ()
+    ranked: tuple[tuple[str, ...], ...] = ()
     queue: tuple[str, ...] = ()
     failed: tuple[tuple[str, ...], ...] = ()
     columns: tuple[Column, ...] = ()

@@ -1,10 +1,11 @@
-"""Rivals of kept pieces: who did about as well in the round that chose, and nobody else."""
+"""Rivals of kept pieces: what promises about as much in their place, and nothing else."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import pytest
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.rivals import rivals
 from sipe_bayes.structure.search import StructureSearch
-from sipe_bayes.structure.state import DiscoverState, Judgement, Phase
+from sipe_bayes.structure.state import DiscoverState, Judgement, Offer, Phase
 
 EMPTY = np.zeros(0)
 
@@ -25,33 +26,45 @@ def structure(labels: str, evidence: float) -> FittedStructure:
     )
 
 
-def test_rivals_are_those_that_came_close_in_the_round_of_the_piece() -> None:
-    fitted = [
-        structure("", 0),
-        structure("a", 100),
-        structure("b", 95),  # close to a
-        structure("c", 50),  # far behind it
-        structure("ad", 200),
-        structure("ae", 199),
-        structure("af", 193),
-        structure("ag", 192),  # close as well, but the third
-        structure("d", 99),  # close, but kept itself
-    ]
-    tried = list(rivals(fitted, ("a", "d"), lambda one: one.evidence, share=0.1, most=2))
-    assert [(rival.labels, rival.kept) for rival in tried] == [
-        (("b", "d"), "a"),
-        (("a", "e"), "d"),
-        (("a", "f"), "d"),
-    ]
-    assert [rival.theta.tolist() for rival in tried] == [[ord(x) / 1000] for x in "bef"]
-    assert not list(rivals(fitted, ("a", "d"), lambda one: one.evidence, share=0.1, most=0))
+def offer(at: str, label: str, gain: float) -> Offer:
+    return Offer(tuple(at), label, gain, np.array([ord(label) / 1000]), np.array([0.5, *(ord(x) / 1000 for x in at)]))
 
 
-def test_a_piece_whose_round_is_not_known_has_no_rivals() -> None:
-    """After a piece was left out, what was fitted beside it says nothing of the rest."""
-    fitted = [structure("", 0), structure("ad", 200), structure("ae", 199), structure("d", 100), structure("e", 20)]
-    assert [r.labels for r in rivals(fitted, ("d",), lambda one: one.evidence, 0.1, 2)] == []
-    assert [r.labels for r in rivals(fitted, ("d",), lambda one: one.evidence, 0.9, 2)] == [("e",)]
+def test_rivals_are_those_that_promise_about_as_much_in_the_whole_structure() -> None:
+    """Whatever they promised in the round that chose, while the other piece was missing."""
+    early = [offer("", "d", 100), offer("", "b", 30), offer("", "c", 99)]
+    late = [offer("a", label, gain) for label, gain in (("d", 200), ("b", 199), ("c", 40), ("e", 190), ("f", 185))]
+    offers = [*early, *late]
+    assert [o.label for o in rivals(offers, ("a",), ("a", "d"), share=0.1, most=5)] == ["b", "e", "f"]
+    assert [o.label for o in rivals(offers, ("a",), ("d", "a"), share=0.1, most=1)] == ["b"]
+    assert [o.label for o in rivals(offers, (), ("d",), share=0.1, most=5)] == ["c"]
+    assert not rivals([offer("a", "g", -1.0)], ("a",), ("a", "d"), share=0.1, most=5)
+
+
+def test_what_was_not_fitted_in_its_round_is_fitted_in_the_place_of_a_kept_piece() -> None:
+    """Beside a, b promises as much as d; it fits better, and is kept. Nothing is fitted or ranked twice."""
+    fitted: list[FittedStructure] = [structure("", 0), structure("a", 100), structure("d", 90), structure("ad", 200)]
+    asked: list[tuple[str, ...]] = []
+    fitting: Any = SimpleNamespace(holdout=None, corrected=lambda columns: fitting)
+    search = StructureSearch(fitting, ())
+
+    def ranked(state: DiscoverState, here: FittedStructure, last_resort: bool) -> tuple[DiscoverState, list[Any]]:
+        asked.append(here.labels)
+        gains = {"b": 99.0, "d": 100.0, "c": 60.0} if here.labels == ("a",) else {"a": 100.0, "c": 10.0}
+        new = tuple(offer("".join(here.labels), label, gain) for label, gain in gains.items())
+        return replace(state, offers=state.offers + new, ranked=(*state.ranked, here.labels)), []
+
+    def fit(state: DiscoverState, labels: tuple[str, ...], initial: np.ndarray) -> DiscoverState:
+        assert initial.tolist() == [0.5, ord("a") / 1000, ord("b") / 1000]
+        return replace(state, fitted=(*state.fitted, structure("".join(labels), 210)))
+
+    with mock.patch.object(search, "_ranked", ranked), mock.patch.object(search, "_fitted", fit):
+        state = DiscoverState(Phase.SWAP, tuple(fitted), ("a", "d"))
+        for _ in range(6):
+            state = search._swap(state) if state.phase is Phase.SWAP else state
+    assert sorted(asked) == [("a",), ("d",)]
+    assert state.present == ("a", "b")
+    assert state.phase is Phase.RESIDUAL
 
 
 @pytest.mark.parametrize(("log_score", "ends_with"), [(50.0, ("b", "d")), (-50.0, ("a", "d")), (None, ("b", "d"))])
@@ -67,7 +80,8 @@ def test_a_rival_takes_the_place_unless_held_out_logs_speak_against_it(
     judged = (Judgement(("a", "d"), 0.0, 1), Judgement(("b", "d"), log_score, 1))
     fitting: Any = SimpleNamespace(holdout="logs", corrected=lambda columns: fitting)
     search = StructureSearch(fitting, ())
-    state = DiscoverState(Phase.SWAP, fitted, ("a", "d"), judged=judged)
+    asked = (("a",), (), ("b",), ("d",))
+    state = DiscoverState(Phase.SWAP, fitted, ("a", "d"), judged=judged, ranked=asked)
     for _ in range(2):
         state = search._swap(state)
     assert state.present == ends_with
