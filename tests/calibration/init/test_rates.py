@@ -9,19 +9,23 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sipe_bayes.calibration.init.draft import Draft, Reading
+from sipe_bayes.calibration.init.decisions import missing_more
+from sipe_bayes.calibration.init.draft import Draft, Reading, Scale
 from sipe_bayes.calibration.init.gyros import Gyro, hinges_of
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.write import toml_of
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectory
 
-BOOM = """<mujoco><option timestep="0.002" integrator="implicitfast" gravity="0 0 {gravity}"/><worldbody><body name="mast">
-  <joint name="slew" axis="0 0 1" damping=".3"/><geom type="box" size=".05 .05 .2" mass="1" contype="0" conaffinity="0"/>
+BOOM = """<mujoco><option timestep="0.002" integrator="implicitfast" gravity="0 0 {gravity}"/><worldbody>
+  <body name="mast">
+  <joint name="slew" axis="0 0 1" damping=".3"/>
+  <geom type="box" size=".05 .05 .2" mass="1" contype="0" conaffinity="0"/>
   <body name="boom" pos="0 0 .2"><joint name="luff" axis="0 1 0" damping=".3"/>
   <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass=".5" contype="0" conaffinity="0"/>
   <site name="tip" pos=".3 0 0"/></body></body></worldbody>
-  <actuator><velocity name="slew_drive" joint="slew" kv="3"/><velocity name="luff_drive" joint="luff" kv="3"/></actuator>
+  <actuator><velocity name="slew_drive" joint="slew" kv="3"/>
+  <velocity name="luff_drive" joint="luff" kv="3"/></actuator>
   {sensor}</mujoco>"""
 SENSOR = '<sensor><gyro name="gyro" site="tip"/></sensor>'
 TURN, DT = 2 * np.pi, 0.01
@@ -142,3 +146,19 @@ def test_a_gyro_on_what_moves_freely_tells_nothing_of_hinges() -> None:
         '</body></body></worldbody><sensor><gyro name="g" site="s"/></sensor></mujoco>'
     )
     assert hinges_of(model, "g") is None
+
+
+def test_units_that_many_others_miss_more_than_are_one_line() -> None:
+    one, answer = [(Scale("deg"), 12.34)], Scale("rev", 1 / 4096)
+    many = [(Scale("rev", 1 / count), times) for count, times in ((1024, 2.41), (2048, 25.4), (360, 3.0), (400, 9.0))]
+    assert missing_more(Scale("rad"), one) == "rad: read as deg, simulated windows miss 12 times as much"
+    words = "4096 counts a rev: with 4 other usual counts a rev, simulated windows miss 2.4 to 25 times as much"
+    assert missing_more(answer, many) == words
+
+
+def test_what_is_being_done_is_told(tmp_path: Path) -> None:
+    lines: list[str] = []
+    (tmp_path / "model.xml").write_text(BOOM.format(gravity=0.0, sensor=SENSOR))
+    pd.DataFrame(moved(0.0, 300)).to_csv(tmp_path / "log.csv", index=False)
+    propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path, tell=lines.append)
+    assert lines == ["reading the logs", "zeros of joints", "units and signs", "delay and unknowns"]
