@@ -98,6 +98,16 @@ def test_a_gyro_in_degrees_that_no_name_tells(tmp_path: Path) -> None:
     assert "# factor = 0.00025" in toml_of(draft, "sipe init")
 
 
+def test_degrees_or_radians_of_both_are_left_to_simulations(tmp_path: Path) -> None:
+    """Of angles and rates whose names say no unit: the gyro's follows that of the angles."""
+    columns = moved(-9.81)
+    felt(columns, 180 / np.pi)
+    columns |= {name: np.degrees(columns[name]) for name in ("slew", "luff")}
+    readings = by_column(proposed(tmp_path, columns, gravity=-9.81))
+    assert (readings["luff"].unit, readings["slew"].unit, readings["gyro_x"].unit) == ("deg", "deg", "deg/s"), readings
+    assert (readings["luff"].sign, readings["slew"].sign) == (1, 1)
+
+
 def test_counts_that_nobody_uses_are_measured(tmp_path: Path) -> None:
     """Behind a gear of 7."""
     columns = counted(moved(0.0), 28672, 28672)
