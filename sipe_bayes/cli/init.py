@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from sipe_bayes.cli.errors import command_line, exit_on_error
+from sipe_bayes.inference.progress_bar import ProgressBar
 
 
 def init(
@@ -25,7 +26,9 @@ def init(
                 raise ValueError("--check: takes one configuration and nothing else; drop the other arguments")
             from sipe_bayes.calibration.init.check import checked
 
-            result = checked(check)
+            with ProgressBar(unit="configuration", counted=False) as progress:
+                progress(f"holding {check} against simulations of its logs", 0, 1)
+                result = checked(check)
             agreed = "units, signs, delays and columns agree with simulations"
             untold = f"in what simulations tell, which leaves {len(result.doubts)} things open"
             nothing = f"{check}: nothing is odd{f' {untold}' if result.doubts else f': {agreed}'}"
@@ -42,7 +45,8 @@ def init(
         from sipe_bayes.calibration.init.write import summary, toml_of
         from sipe_bayes.core.files import write_text
 
-        draft = propose(model, logs, out.parent, rate)
+        with ProgressBar(unit="configuration", counted=False) as progress:
+            draft = propose(model, logs, out.parent, rate, lambda what: progress(what, 0, 1))
         write_text(out, toml_of(draft, command_line()))
     for line in summary(draft, str(out)):
         print(line)

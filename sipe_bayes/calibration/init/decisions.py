@@ -37,7 +37,7 @@ _FAR = np.log(4.0)  # behind the best, up to which combinations are fitted
 _SAME = np.log(1.02)
 _HARDLY = 1.1  # times the miss: as well
 _DOUBLED = 2.0  # times the miss, below which what the model lacks may decide for the wrong unit
-_UNLIKELY = 0.01  # by which what is not likely has to be better
+_NAMED = 3  # units that are named where they miss more
 _FITTED = 4  # units, and combinations of signs with each, that are fitted where the nominal model does not decide
 _FIRST_DELAYS = (0, 1, 2, 4)
 
@@ -129,8 +129,8 @@ class Ranking:
 
 
 def _unlikely(asked: Sequence[Question], answers: Sequence[Answer]) -> float:
-    """A little against turned signs and units that are not the likeliest: they have to be better by it."""
-    return sum(_UNLIKELY for q, a in zip(asked, answers, strict=True) if a != q.answers[0])
+    """What speaks against turned signs and units that are not the likeliest: they have to be better by it."""
+    return sum(q.against for q, a in zip(asked, answers, strict=True) if a != q.answers[0])
 
 
 def decide(draft: Draft, machine: Machine, trial: Trial, layout: Layout) -> Draft:
@@ -149,6 +149,9 @@ def decide(draft: Draft, machine: Machine, trial: Trial, layout: Layout) -> Draf
     base = case.misses([readings])[0]
     if base.min() > _USELESS:
         return _by_names(draft, asked)
+    if any(reading.turning not in (0, reading.sign) for reading in readings):  # the gyro is mounted otherwise
+        alone = [replace(reading, turning=0) for reading in draft.readings]
+        return decide(_read_as(draft, alone, draft.doubts), machine, trial, layout)
     for q in range(len(asked)):
         readings = _with_evidence(case, asked, ranking, q, readings, base)
     readings = _against_names(case, readings, base)
@@ -304,7 +307,7 @@ def _with_evidence(
     misses = case.misses(sets)
     clearer = followed(misses) - followed(base)
     ratios = (misses / base)[:, base < 1].max(axis=1)
-    out, rivals = list(readings), list[tuple[Scale, float]]()
+    out, rivals, rejected = list(readings), list[tuple[Scale, float]](), list[tuple[Scale, float]]()
     for other, alone, ratio in zip(others, clearer, ratios, strict=True):
         together, times = ranking.gap(q, other), f"{ratio:.2g}"
         note, doubt, instead = "", "", ""
@@ -312,7 +315,7 @@ def _with_evidence(
             if together < ranking.decided or ratio < _DOUBLED:
                 rivals.append((other, float(1.0 if together < ranking.decided else ratio)))
             else:
-                note = f"{answer}: read as {other}, simulated windows miss {times} times as much"
+                rejected.append((other, float(ratio)))
         elif alone < ranking.decided and together < ranking.decided:
             doubt, instead = "its sign does not show in these logs", f"sign = {other}"
         elif together < ranking.decided:
@@ -321,11 +324,25 @@ def _with_evidence(
                 "the others that belong to it are turned too"
             )
         else:
-            note = f"sign {answer}: turned round, simulated windows miss {times} times as much"
+            shows = alone >= ranking.decided or not out[question.readings[0]].turning
+            reasons = ["a gyro turns with it"] if out[question.readings[0]].turning else []
+            reasons += [f"turned round, simulated windows miss {times} times as much"] if shows else []
+            note = f"sign {answer}: {'; '.join(reasons)}"
         _put(out, question, note, doubt, instead)
+    if rejected:
+        _put(out, question, missing_more(answer, rejected), "", "")
     if rivals:
         _put(out, question, "", as_well(answer, rivals), "\n".join(key for other, _ in rivals for key in other.keys))
     return out
+
+
+def missing_more(answer: Answer, others: Sequence[tuple[Scale, float]]) -> str:
+    """That others are wrong, each with its misses over those of the answer, in one line."""
+    times = sorted({f"{ratio:.2g}" for _, ratio in others}, key=float)
+    more = f"{' to '.join(dict.fromkeys((times[0], times[-1])))} times as much"
+    if len(others) <= _NAMED:
+        return f"{answer}: read as {' or '.join(str(other) for other, _ in others)}, simulated windows miss {more}"
+    return f"{answer}: with {len(others)} other usual counts a {others[0][0].unit}, simulated windows miss {more}"
 
 
 def as_well(answer: Answer, rivals: Sequence[tuple[Scale, float]]) -> str:

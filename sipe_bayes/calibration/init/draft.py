@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_fields import Use
 from sipe_bayes.calibration.init.columns.match import Match
@@ -18,6 +20,9 @@ from sipe_bayes.calibration.init.machine import Drive, Machine
 from sipe_bayes.calibration.init.tables import Clock
 
 Row = dict[str, object]
+
+_UNLIKELY = 0.01  # of the logarithm of misses, by which what is not likely has to be better
+_TURNED = float(np.log(2.0))  # and a sign that a gyro speaks against, which may be mounted otherwise
 
 
 class Scale(NamedTuple):
@@ -50,6 +55,7 @@ class Reading:
         fit: False for what only starts windows.
         scales: what it may be besides units of its kind: counts.
         supply: column of the voltage that a duty is a share of, and its unit.
+        turning: the sign that a gyro speaks for; 0 where none does.
         notes: the evidence, each a comment.
         doubts: what could not be decided, each a comment and told.
         instead: lines of TOML that are the alternative where something could not be decided.
@@ -65,6 +71,7 @@ class Reading:
     fit: bool = True
     scales: tuple[Scale, ...] = ()
     supply: tuple[str, str] | None = None
+    turning: int = 0
     notes: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
     instead: tuple[str, ...] = ()
@@ -211,10 +218,12 @@ class Question:
     Args:
         readings: places in ``Draft.readings``.
         answers: scales or signs, the likeliest first: what names say, or a configuration that is checked.
+        against: by how much another answer than the first has to be better, of the logarithm of misses.
     """
 
     readings: tuple[int, ...]
     answers: tuple[Answer, ...]
+    against: float = _UNLIKELY
 
     @property
     def of_sign(self) -> bool:
@@ -263,7 +272,8 @@ def questions(draft: Draft, machine: Machine) -> list[Question]:
             own = "command" if reading.commanded else "measured"
             groups.setdefault((own, scales), []).append(k)
         if len(reading.match.columns) == 1 and reading.match.target not in one_way:
-            signs.append(Question((k,), (reading.sign, turned(reading.sign))))
+            against = _TURNED if reading.turning else _UNLIKELY
+            signs.append(Question((k,), (reading.sign, turned(reading.sign)), against))
     return [Question(tuple(members), scales) for (_, scales), members in groups.items()] + signs
 
 

@@ -19,6 +19,7 @@ from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading, Unknown
 from sipe_bayes.calibration.init.fits import fit
 from sipe_bayes.calibration.init.forces import with_forces
 from sipe_bayes.calibration.init.machine import Machine, Sizes, touching_bodies
+from sipe_bayes.calibration.init.rates import rates_of, with_evidence_of, with_rates
 from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
 from sipe_bayes.calibration.init.tables import Opened, open_table
 from sipe_bayes.calibration.init.trials import Trial
@@ -52,6 +53,7 @@ from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 from sipe_bayes.envs.internal.closed_chains import dependent_joints
 from sipe_bayes.envs.poses import has_pose, is_round
+from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.starts import estimate_states
 
 _PASSED = 300  # states of each log, of which it is looked what they touch
@@ -62,10 +64,13 @@ _SINGLE, _COUPLED = 0.4, 0.2  # of the time in which the motion goes to and fro,
 _LARGEST_BIAS = {"accelerometer": 1.0, "gyro": 0.2}  # m/s^2, rad/s
 _BLIND = 0.5  # s, windows where nothing tells how fast the machine moves
 _TURNING = 24  # windows of the fit of what turns freely: contacts take their time
+_ROUNDS = 20  # of the fit of unknowns: with dry friction and a delay 12 end far from the optimum, at another delay
 _SHORT = 2.0  # s: logs as short are one window each
 
 
-def propose(model_path: Path, logs: Sequence[Path], folder: Path, rate: float | None = None) -> Draft:
+def propose(
+    model_path: Path, logs: Sequence[Path], folder: Path, rate: float | None = None, tell: Tell = silent
+) -> Draft:
     """A configuration for a model and its logs.
 
     Args:
@@ -73,11 +78,13 @@ def propose(model_path: Path, logs: Sequence[Path], folder: Path, rate: float | 
         logs: files, folders of files, or patterns.
         folder: of the configuration, to which its paths are relative.
         rate: Hz, of logs without a clock.
+        tell: called with what is being done.
 
     Raises:
         ModelError: for a model that does not compile.
         LogError: for logs that can not be read, or that hold nothing of the model.
     """
+    tell("reading the logs")
     model = compile_spec(load_spec(str(model_path)), str(model_path))
     machine = Machine.of(model)
     files = _files(logs)
@@ -95,7 +102,7 @@ def propose(model_path: Path, logs: Sequence[Path], folder: Path, rate: float | 
     )  # fmt: skip
     positions = bool(tried_part(draft).measurements)
     trained = (
-        _decided(draft, model, machine, sources, folder, matches.forces)
+        _decided(draft, model, machine, sources, folder, matches.forces, tell)
         if positions
         else _undecided(draft, model, machine)
     )
@@ -277,11 +284,15 @@ def _decided(
     sources: list[Source],
     folder: Path,
     forces: Sequence[Match],
+    tell: Tell,
 ) -> Draft:
     """Units, signs, delay, unknowns and the window's length, by simulations of the logs."""
+    draft = replace(draft, unknowns=tuple(rough_unknowns(model, machine, draft.readings)))
+    rates = rates_of(draft, model, machine, sources, folder)
+    draft = with_rates(draft, rates)
     part = tried_part(draft)
     rest = tuple(r for r in draft.measurements if r not in part.measurements)
-    part = replace(part, unknowns=tuple(rough_unknowns(model, machine, draft.readings)))
+    tell("zeros of joints")
     trial, layout = trial_of(part, model, machine, loaded(part, sources, folder), folder, FEW)
     against_world = absolute_angles(part, model, machine, trial, layout)
     wide, _ = trial_of(part, model, machine, trial.logs, folder, SOME)
@@ -291,16 +302,19 @@ def _decided(
         left = absolute_angles(placed, model, machine, moved, layout)
         if not (against_world and left):  # else it was no zero that made an angle look like one against the world
             part, trial, against_world = placed, moved, left
+    tell("units and signs")
     part = decide(part, machine, trial, layout)
     part, unlike = with_forces(part, forces, model, machine, sources, folder)
     logs = loaded(part, sources, folder)
+    tell("delay and unknowns")
     unknowns, delay, notes, lost = _unknowns(part, model, machine, logs, folder)
     unknowns, doubts = _some(unknowns)
     window, why = _window(machine, logs, trial)
-    return replace(
+    done = replace(
         part, measurements=(*part.measurements, *rest), unknowns=tuple(unknowns), window=window, window_note=why,
         notes=(*draft.notes, *unlike, *notes), doubts=(*against_world, *part.doubts, *lost, *doubts), delay=delay,
     )  # fmt: skip
+    return with_evidence_of(done, rates)
 
 
 def _undecided(draft: Draft, model: mujoco.MjModel, machine: Machine) -> Draft:
@@ -333,7 +347,7 @@ def _unknowns(
     names = list(trial.simulator.space.names)
     unknowns = [unknown for unknown in unknowns if unknown.name in names]
     actuators = [r.match.target.removeprefix("actuator:") for r in draft.commands]
-    left = fit(trial, trial.given, delays_of(trial, logs[0].dt), rounds=12)
+    left = fit(trial, trial.given, delays_of(trial, logs[0].dt), _ROUNDS)
     late, note = delay_of(actuators, left, logs[0].dt)
     samples = left.finer if late else 0.0
     given = trial.simulator.space.default_theta

@@ -25,6 +25,7 @@ _LATE = 1.0  # samples
 _ALIKE = 0.9  # share of variance from which a command is a set-point
 _UNLIKE = 0.2
 _COUNTS = (4096, 1024, 2048, 8192, 16384, 65536, 4000, 2000, 1000, 400, 10000, 20000, 131072, 360)  # to a turn
+_RARER = (8000, 16000, 32768, 40000, 262144)  # that simulations do not tell from the others
 _FEWEST_COUNTS = 30
 _LEAST_TURN, _MOST_TURNS = 0.01, 12.0
 _SHARES = (1.0, 100.0)  # that need not be whole numbers
@@ -103,6 +104,11 @@ def _counts(values: FloatArray) -> tuple[Scale, ...]:
         return ()
     turns = (_LEAST_TURN, _MOST_TURNS)
     return tuple(Scale("rev", 1 / n) for n in _COUNTS if turns[0] < span / n < turns[1])
+
+
+def counts_of(scales: Sequence[Scale]) -> tuple[Scale, ...]:
+    """What whole numbers that are tried may be of a turn, and rarer ones."""
+    return (*scales, *(Scale("rev", 1 / n) for n in _RARER))
 
 
 def _matched(match: Match) -> tuple[str, ...]:
