@@ -89,7 +89,10 @@ class Thresholds(Options):
     )
 
     open_structure: float = option(
-        0.05, "a piece that the best structure does without is named beside it from this probability on", "probability"
+        0.01,
+        "a piece that the best structure does without is named beside it from this probability on: Laplace's method "
+        "tells evidence to a few nats, and a piece that acts nearly alike need not have lost",
+        "probability",
     )
 
     # predictions of held-out logs
