@@ -32,7 +32,7 @@ def piece(name: str, site: str = "hinge", kept: bool = False, **changes: object)
         "label": f"{name}:{site}",
         "sentence": f"{name} at {site}",
         "reference": "somebody 1900",
-        "probability": 0.97 if kept else 0.02,
+        "probability": 0.97 if kept else 0.002,
         "evidence": 40.0,
         "held_out": 30.0,
         "log_score": None,
