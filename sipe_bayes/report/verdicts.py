@@ -241,7 +241,8 @@ def lack(calibration: Calibration) -> Verdict | None:
     text = f"The model lacks something: it looks like {misfit.cause} ({share}, {misfit.p_text})"
     moved = sorted(misfit.moved, key=lambda name: -abs(misfit.shift[name]))[:_DOUBTS]
     if moved:
-        text += f"; with it, to first order, {listed([_would_be(calibration, name, misfit.shift[name]) for name in moved])}"
+        values = [_would_be(calibration, name, misfit.shift[name]) for name in moved]
+        text += f"; with it, to first order, {listed(values)}"
     return Verdict("bad", f"{text}. `sipe discover` tries it." if misfit.shift else f"{text}.")
 
 
