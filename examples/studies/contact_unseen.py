@@ -1,0 +1,111 @@
+"""`laplace` on StateSpace through contact, on machines for which nothing in this package was made or changed.
+
+A gripper that closes on a box and carries it, a wheel that a paddle rolls against a sprung stop, an arm that scrapes a
+table, three bumpers in a row (`models/`). Truths, noise, lengths and what is counted are those of `contact.py`.
+
+    python examples/studies/contact_unseen.py --seeds 0 10       # half a minute of a core for each fit, in the mean
+
+Fits are kept in runs/contact_unseen and an interrupted study goes on; results/contact_unseen.json holds the summary.
+Where the numbers are looked at to change the method, the machines move to `contact.py`, and others come here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from importlib.metadata import version
+from itertools import product
+from typing import Any
+
+import contact
+import numpy as np
+from _kept import fits, keep
+
+import sipe_bayes as sipe
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.files import write_text
+
+RUNS, RESULTS = contact.HERE / "runs" / "contact_unseen", contact.HERE / "results" / "contact_unseen.json"
+LEVEL, STEPS = 0.01, 200
+JOINTS = {
+    "gripper": ("lift", "sweep", "left_slide", "right_slide", "obj_x", "obj_z", "obj_turn"),
+    "roller": ("paddle", "stop", "wheel_x", "wheel_z", "wheel_turn"),
+    "scraper": ("shoulder", "elbow"),
+    "bumpers": ("driver", "middle", "last"),
+}
+MOTORS = {
+    "gripper": ("lift", "sweep", "left", "right"),
+    "roller": ("push",),
+    "scraper": ("shoulder", "elbow"),
+    "bumpers": ("push",),
+}
+UNKNOWN = {
+    "gripper": [
+        ("object_mass", 0.15, 0.8, ("body:object.mass",)),
+        ("pad_friction", 0.4, 1.5, ("geom:left_pad.friction", "geom:right_pad.friction")),
+        ("finger_damping", 2.0, 14.0, ("joint:left_slide.damping", "joint:right_slide.damping")),
+        ("hand_mass", 0.4, 1.6, ("body:hand.mass",)),
+    ],
+    "roller": [
+        ("wheel_mass", 0.4, 1.6, ("body:wheel.mass",)),
+        ("stop_stiffness", 60.0, 300.0, ("joint:stop.stiffness",)),
+        ("paddle_damping", 2.0, 12.0, ("joint:paddle.damping",)),
+        ("friction", 0.2, 1.2, ("geom:wheel.friction", "geom:floor.friction")),
+    ],
+    "scraper": [
+        ("upper_mass", 0.7, 2.5, ("body:upper.mass",)),
+        ("friction", 0.2, 1.0, ("geom:tip.friction", "geom:table.friction")),
+        ("elbow_damping", 0.1, 1.0, ("joint:elbow.damping",)),
+        ("shoulder_damping", 0.2, 1.5, ("joint:shoulder.damping",)),
+    ],
+    "bumpers": [
+        ("middle_mass", 0.3, 1.2, ("body:middle.mass",)),
+        ("dry_friction", 0.1, 0.9, ("joint:middle.frictionloss",)),
+        ("last_mass", 0.5, 2.0, ("body:last.mass",)),
+        ("driver_damping", 1.0, 6.0, ("joint:driver.damping",)),
+    ],
+}
+
+
+def commands(name: str, seed: int, steps: int, count: int) -> FloatArray:
+    """(T, A): sums of sines; about a closed grip, and pressed on the table."""
+    rng = np.random.default_rng([seed, 3])
+    frequency, phase = rng.uniform(0.3, 2.0, (3, count)), rng.uniform(0, 2 * np.pi, (3, count))
+    times = contact.DT * np.arange(steps)[:, None, None]
+    actions = 0.8 * np.sin(2 * np.pi * frequency * times + phase).mean(1)
+    if name == "gripper":
+        return np.stack([0.06 + 0.1 * actions[:, 0], 0.15 * actions[:, 1], *(0.55 + 0.35 * actions[:, 2:].T)], axis=-1)
+    if name == "scraper":
+        return np.stack([actions[:, 0] - 0.25, 0.9 * actions[:, 1]], axis=-1)
+    return np.asarray(actions)
+
+
+def clean(simulator: sipe.Simulator, name: str, theta: FloatArray, seed: int, steps: int) -> sipe.Trajectory:
+    """A log without noise."""
+    actions = commands(name, seed, steps, simulator.environment.num_actions)
+    return simulator.rollout(theta, actions, simulator.default_state(), dt=contact.DT)[0]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--machines", nargs="+", default=list(UNKNOWN), choices=list(UNKNOWN))
+    parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), default=[0, 10])
+    given = parser.parse_args()
+    contact.UNKNOWN, contact.JOINTS, contact.MOTORS, contact.clean = UNKNOWN, JOINTS, MOTORS, clean
+    file = RUNS / "fits.jsonl"
+    for seed, name in product(range(*given.seeds), given.machines):
+        which = {"model": name, "level": LEVEL, "steps": STEPS, "seed": seed}
+        if not any(which.items() <= row.items() for row in fits(file)):
+            print(json.dumps(keep(file, contact.one_fit(name, LEVEL, seed, STEPS))), flush=True)
+    rows: list[dict[str, Any]] = sorted(fits(file), key=lambda row: row["seed"])
+    table = {
+        "command": f"python examples/studies/contact_unseen.py --seeds {given.seeds[0]} {given.seeds[1]}",
+        "versions": {p: version(p) for p in ("mujoco", "numpy", "scipy")},
+        "machines": {n: contact.summary(own) for n in UNKNOWN if (own := [r for r in rows if r["model"] == n])},
+        "all": contact.summary(rows),
+    }
+    write_text(RESULTS, json.dumps(table, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
