@@ -21,6 +21,7 @@ Families = Mapping[str, list[Label]]
 
 _NEVER = -2.0
 _CALLED = 0.65  # how alike a column and a joint are, from which it is called after it
+_BACK = 0.01  # of its steps, from which a column that goes back is no clock
 _RIVAL = 3.0  # by which a column for a command may fit worse than the chosen one and still be named
 
 
@@ -28,6 +29,7 @@ def match_columns(machine: Machine, table: Table) -> Matches:
     """Match varying columns to a model; table: column -> (n,) numbers of one log, without its clocks."""
     own = _own_words(machine)
     labels = [read_name(name, own) for name in table]
+    labels = [replace(x, kind=Kind.UNKNOWN) if x.kind == Kind.TIME and _falls(table[x.column]) else x for x in labels]
     labels = [label for label in labels if label.kind not in (Kind.TIME, Kind.EPISODE)]
     vectors, labels = match_vectors(machine, labels)
     vectors, open_vectors = held_open(vectors)
@@ -46,6 +48,12 @@ def match_columns(machine: Machine, table: Table) -> Matches:
     return Matches(
         tuple(positions), tuple(velocities), tuple(commands), tuple(vectors), tuple(rivals), left, doubts, tuple(forces)
     )
+
+
+def _falls(values: FloatArray) -> bool:
+    """Whether a column goes back, as the ticks of a wheel do and those of a clock do not."""
+    steps = np.diff(values[np.isfinite(values)])
+    return bool((steps < 0).sum() > _BACK * max(1, (steps != 0).sum()))
 
 
 def _own_words(machine: Machine) -> set[str]:
@@ -179,6 +187,10 @@ def _commands(machine: Machine, labels: Sequence[Label], places: Mapping[str, in
     scores -= [[0.002 * k] for k in range(len(labels))]
     pairs = sorted(_solved(scores), key=lambda pair: pair[1])
     alone = len(actuators) == 1
+    rest = [i for i, x in enumerate(labels) if x.commanded and i not in {i for i, _ in pairs}]
+    undriven = sorted(set(range(len(actuators))) - {j for _, j in pairs})
+    if len(rest) == len(undriven) == 1:  # whatever it is called
+        pairs.append((rest[0], undriven[0]))
     commands, rivals = [], []
     for i, j in pairs:
         target = f"actuator:{actuators[j].name}"

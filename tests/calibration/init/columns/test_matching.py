@@ -153,3 +153,24 @@ def test_a_column_called_as_an_actuator_drives_it_where_nothing_else_does(
     matches = matched(Machine.of(mujoco.MjModel.from_xml_string(BEAM.format(kind="position"))), columns)
     assert [m.column for m in matches.commands] == [driving] * (driving is not None)
     assert [m.column for m in matches.positions] == measured
+
+
+@pytest.mark.parametrize(
+    ("columns", "driving"),
+    [
+        (["Pressure set (bar)", "beam_deg", "ball_mm"], "Pressure set (bar)"),
+        (["Pressure (bar)", "beam_deg", "ball_mm"], None),  # which is measured, for all that is said
+        (["Pressure set (bar)", "Valve set (V)", "beam_deg", "ball_mm"], None),  # either may
+    ],
+)
+def test_the_one_command_drives_the_one_actuator_whatever_it_is_called(columns: list[str], driving: str | None) -> None:
+    matches = matched(Machine.of(mujoco.MjModel.from_xml_string(BEAM.format(kind="motor"))), columns)
+    assert [m.column for m in matches.commands] == [driving] * (driving is not None)
+
+
+def test_ticks_that_go_back_are_a_joints_and_no_clock() -> None:
+    """`beam` is the body of the joint; a clock of ticks only rises."""
+    machine, rows = Machine.of(mujoco.MjModel.from_xml_string(BEAM.format(kind="motor"))), np.arange(30.0)
+    table = {"u": rows, "beam_ticks": np.round(100 * np.sin(rows)), "ball_mm": rows}
+    assert [m.column for m in match_columns(machine, table).positions] == ["beam_ticks", "ball_mm"]
+    assert [m.column for m in match_columns(machine, {**table, "beam_ticks": rows}).positions] == ["ball_mm"]
