@@ -33,7 +33,7 @@ from sipe_bayes.envs.channels import (
 )
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 from sipe_bayes.envs.inertia import check_inertia, restore_inertia
-from sipe_bayes.envs.internal.states import filtered_commands, start_sd
+from sipe_bayes.envs.internal.states import filtered_command, filtered_commands, start_sd
 from sipe_bayes.envs.laws.base import LawError
 from sipe_bayes.envs.laws.bound import declare, laws_of, moving_on
 from sipe_bayes.envs.laws.firmware import firmware_of, supplies_of
@@ -330,8 +330,10 @@ class MjcfEnvironment(Environment):
             return states
         states, timestep = moving_on(laws, states), np.asarray(timestep)
         for index, column in filtered:
+            tau, steps = float(model.actuator_dynprm[index, 0]), np.broadcast_to(timestep, len(actions))
             for row, past in enumerate(actions):
-                states[row, column] = self.control(model, states[row], past[-1])[int(model.actuator_ctrladr[index])]
+                command = filtered_command(past, tau, float(steps[row]))
+                states[row, column] = self.control(model, states[row], command)[int(model.actuator_ctrladr[index])]
         start = 1 + model.nq + model.nv + model.na
         for column, actuator in enumerate(self.actuators):
             index = named(model, "actuator", actuator, "actuator")

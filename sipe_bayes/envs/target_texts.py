@@ -77,7 +77,7 @@ TARGET_TEXTS: dict[str, dict[str, str]] = {
         "delay": "s; the command arrives later, interpolated between physics steps",
         "force_limit": "largest force either way",
         "command_limit": "largest command either way",
-        "lag": 's; time constant of an actuator with `dyntype="filterexact"`, or of a dcmotor\'s current',
+        "lag": 's; time constant of an actuator with `dyntype="filterexact"` or `"filter"`, or of a dcmotor\'s current',
         "force_drop": "share of the force that is lost for each unit of it; a law",
         "supply_sag": "share of the force that is lost for each unit of the forces of all actuators; a law",
     },

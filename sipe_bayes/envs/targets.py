@@ -274,10 +274,13 @@ def _limit(field: str, unit: str, at: str = "") -> Maker:
 
 def _lag(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
     kind, tau = int(model.actuator_dyntype[actuator]), float(model.actuator_dynprm[actuator, 0])
-    if kind != int(mujoco.mjtDyn.mjDYN_FILTEREXACT) and not (kind == int(mujoco.mjtDyn.mjDYN_DCMOTOR) and tau > 0):
+    step, dyn = float(model.opt.timestep), mujoco.mjtDyn
+    inductance = kind == int(dyn.mjDYN_DCMOTOR) and tau > 0
+    if not inductance and kind not in (int(dyn.mjDYN_FILTER), int(dyn.mjDYN_FILTEREXACT)):
         raise TargetError(f'target {spec!r}: needs an actuator with dyntype="filterexact", or a dcmotor\'s inductance')
-    target = entry("actuator_dynprm", "s", 0, minimum=0.0)(model, spec, actuator)
-    return replace(target, step=2 * float(model.opt.timestep))  # shorter ones than a physics step act alike
+    least = step if kind == int(dyn.mjDYN_FILTER) else 0.0  # by Euler's steps shorter ones overshoot
+    target = entry("actuator_dynprm", "s", 0, minimum=least)(model, spec, actuator)
+    return replace(target, step=2 * step)  # shorter ones than a physics step act alike
 
 
 def _numeric(number: Number, label: str, slot: int) -> Maker:

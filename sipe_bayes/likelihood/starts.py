@@ -16,7 +16,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.rotations import added, between, bridged, inverse, product, quaternions, rotation_vectors, turned
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.internal.closed_chains import SD, close, dependent_joints, dofs_of
-from sipe_bayes.envs.internal.states import activations_at_rest, joints_at_rest
+from sipe_bayes.envs.internal.states import UNSETTLED, activations_at_rest, joints_at_rest, own_filters
 from sipe_bayes.envs.poses import PoseReading, has_pose, inertial_joints, is_round
 from sipe_bayes.likelihood.state_space.indirect_positions import LogSamples, indirect_positions
 from sipe_bayes.likelihood.state_space.inertial import carried, orientations
@@ -274,11 +274,20 @@ def _seen_in(trajectories: Trajectories) -> BoolArray:
 
 
 def start_sd(simulator: Simulator, trajectories: Trajectories) -> FloatArray:
-    """Prior sds (2 nv + na,) of where windows of logs start: narrow of joints that follow through closed chains."""
+    """Prior sds (2 nv + na,) of where windows of logs start: narrow of joints that follow through closed chains.
+
+    And of filters of the model's own, which the commands before have brought to where they are.
+    """
     model, out = simulator.model, simulator.environment.start_sd(simulator.model).copy()
     for joint in followed_joints(simulator, trajectories):
         dofs = dofs_of(model, joint)
         out[dofs], out[model.nv + dofs] = SD, 10 * SD
+    filters = own_filters(model)
+    if filters:
+        largest = np.abs(simulator.environment.control(model, np.empty(0), trajectories.actions)).max((0, 1))
+        for k in filters:
+            size = float(largest[int(model.actuator_ctrladr[k])])
+            out[2 * model.nv + int(model.actuator_actadr[k])] = UNSETTLED * (size or 1.0)
     return out
 
 
@@ -357,7 +366,7 @@ def past_commands(
 
     Of starts at samples ``start`` (W,) of the logs ``log`` (W,), whose control steps take ``dt`` (W,) seconds.
     """
-    longest = 2000 if simulator.model.nhistory else 1  # longer than any actuator's delay
+    longest = 2000 if simulator.model.nhistory or simulator.model.na else 1  # longer than any delay, and most filters
     past = []
     for k, first, seconds in zip(log, start, dt, strict=True):
         skip = simulator.physics_steps(float(seconds))[0]

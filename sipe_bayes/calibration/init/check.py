@@ -17,12 +17,12 @@ from sipe_bayes.calibration.init.columns.names import read_name
 from sipe_bayes.calibration.init.columns.signals import turn_of
 from sipe_bayes.calibration.init.decisions import AGAINST, decide, fitted_miss
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading
-from sipe_bayes.calibration.init.fits import fit
+from sipe_bayes.calibration.init.fits import delay_of, fit
 from sipe_bayes.calibration.init.machine import Machine, Sizes
 from sipe_bayes.calibration.init.readings import with_velocities
 from sipe_bayes.calibration.init.tables import Opened, open_table
 from sipe_bayes.calibration.init.trials import Assumption, Trial, followed
-from sipe_bayes.calibration.init.unknowns import delay_of, springs
+from sipe_bayes.calibration.init.unknowns import springs
 from sipe_bayes.calibration.init.windows import (
     FEW,
     MANY,

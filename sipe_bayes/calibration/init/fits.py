@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.optimize
 
+from sipe_bayes.calibration.init.draft import Unknown
 from sipe_bayes.calibration.init.trials import Assumption, Trial, spread_of
 from sipe_bayes.core.arrays import FloatArray
 
@@ -23,6 +24,8 @@ _ROUNDING = 1e-13  # of a matrix's trace
 _LOST = 1e6  # of a simulation that has diverged
 _LEAST = 2e-3  # of the motion: noise is taken for no smaller
 _SETTLED = 0.02  # of the logarithm of what is left, of all channels together
+_TELLING = 0.02  # of the squared miss, from which a delay is asked for
+_LITTLE = 1.1  # times the miss without a delay, below which it is uncertain
 _EVEN = 4.0  # both sides of the best delay are about as steep, or no parabola goes through them
 
 
@@ -216,3 +219,30 @@ def _outcome(trial: Trial, slopes: _Slopes, points: dict[int, _Point], best: int
     misses = np.full(channels, np.exp(at.cost / channels)) / np.exp(np.log(whole).mean())
     miss = np.exp(np.clip((costs - at.cost) / channels, -20, 20))
     return Fit(tuple(points), miss, at.theta, by_theta.T / max(mean, _LEAST), misses)
+
+
+def delay_of(actuators: Sequence[str], fit: Fit, dt: float) -> tuple[list[Unknown], str]:
+    """The delay as an unknown where one shows, and what is to be said of it; dt in s."""
+    if not actuators or len(fit.delays) < 2:
+        return [], ""
+    at_zero = float(fit.miss[fit.delays.index(0)] ** 2)
+    best, late = fit.best, fit.finer
+    if not best or at_zero - 1 < _TELLING:
+        return [], "commands arrive at once: a delay would not lessen what simulations miss"
+    if best == fit.delays[-1]:
+        why = "which other things than a delay do as well: look at the model and at what drives it; none is asked for"
+        return [], f"the later commands arrive the better, up to the {1e3 * dt * best:.3g} ms that were tried, {why}"
+    high = rounded_up(dt * max(2 * best, best + 3))
+    targets = tuple(f"actuator:{name}.delay" for name in actuators)
+    times, when = float(np.sqrt(at_zero)), f"{1e3 * dt * late:.3g} ms late, {late:.2g} samples"
+    note = f"commands arrive about {when}: without that, simulated windows miss {times:.2f} times as much"
+    if times < _LITTLE:
+        share = 100 * (1 - 1 / times)
+        note = f"commands may arrive about {when}: uncertain, for it explains {share:.1g} % of what simulations miss"
+    return [Unknown("delay", targets, 0.0, high, False, note)], note  # none at all is what the model has
+
+
+def rounded_up(value: float) -> float:
+    """Upwards to two digits."""
+    digits = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return float(f"{np.ceil(value / digits) * digits:.2g}")

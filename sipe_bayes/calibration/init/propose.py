@@ -16,7 +16,7 @@ from sipe_bayes.calibration.init.columns.matching import match_columns
 from sipe_bayes.calibration.init.columns.names import TURNS, pieces_of
 from sipe_bayes.calibration.init.decisions import decide
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading, Unknown
-from sipe_bayes.calibration.init.fits import fit
+from sipe_bayes.calibration.init.fits import delay_of, fit
 from sipe_bayes.calibration.init.forces import with_forces
 from sipe_bayes.calibration.init.machine import Machine, Sizes, touching_bodies
 from sipe_bayes.calibration.init.rates import rates_of, with_evidence_of, with_rates
@@ -26,7 +26,6 @@ from sipe_bayes.calibration.init.trials import Trial
 from sipe_bayes.calibration.init.unknowns import (
     RELATIVE,
     candidates,
-    delay_of,
     nameless,
     scale_is_open,
     springs,

@@ -159,7 +159,8 @@ class Trial:
         for log, places in zip(self.logs, self.places, strict=True):
             actions = _driven_as(log, assumption)
             commands.append(actions[places[:, None] + np.arange(self.length)])
-            past += [actions[max(0, s - _PAST) : s + 1] for s in places]
+            skip = self.simulator.physics_steps(log.dt)[0]
+            past += [np.repeat(actions[max(0, s - _PAST) : s + 1], skip, axis=0) for s in places]
         flight = self._read[key]
         begun = with_history(self.simulator, flight.states.copy(), past, flight.dt)
         return replace(flight, states=begun, commands=np.concatenate(commands))

@@ -12,7 +12,7 @@ import numpy as np
 
 from sipe_bayes.calibration.init.columns.names import Kind
 from sipe_bayes.calibration.init.draft import Reading, Unknown
-from sipe_bayes.calibration.init.fits import Fit
+from sipe_bayes.calibration.init.fits import Fit, rounded_up
 from sipe_bayes.calibration.init.machine import (
     Actuator,
     Drive,
@@ -44,8 +44,6 @@ _BEYOND = 3.0  # times a bound that the fit presses against
 _CLEAR = 15.0  # of the noise, what it has to move by itself where its share is small
 _MIXED = 0.15  # a share that is small; with more it is asked for: friction that is left out is in all others
 _SLIPPERY = 0.02  # the least friction
-_TELLING = 0.02  # of the squared miss, from which a delay is asked for
-_LITTLE = 1.1  # times the miss without a delay, below which it is uncertain
 
 
 def candidates(
@@ -66,11 +64,12 @@ def candidates(
     """
     measured = {r.match.target.removeprefix("joint:").rpartition(".")[0] for r in readings if not r.commanded}
     joints = [joint for joint in machine.joints if joint.name in measured]
-    gains = [unknown for a, r in _driven(machine, readings) for unknown in _of_actuator(model, a, r)]
+    driven = _driven(machine, readings)
+    gains = [unknown for a, r in driven for unknown in (*_of_actuator(model, a, r), *_lag_of(model, a))]
     open_scale = scale_is_open(model, machine, readings)
     behind = [int(model.joint(joint.name).bodyid[0]) for joint in joints]
     bodies = [model.body(body).id for body in machine.bodies]  # what is pushed, or carries joints
-    free = bodies if _driven(machine, readings) else []  # what is only thrown moves alike whatever its mass
+    free = bodies if driven else []  # what is only thrown moves alike whatever its mass
     masses, attached = _masses(model, [*behind, *free])
     of_joints = [u for joint in joints for u in _of_joint(model, joint, sizes)]
     if open_scale and len(joints) < 2:  # a rotor is so much more mass, to which the gain is relative
@@ -150,6 +149,16 @@ def _of_actuator(model: mujoco.MjModel, actuator: Actuator, reading: Reading) ->
     return [_factor(f"{word}_gain", f"{at}.gain", 0.3, 3.0, note)]
 
 
+def _lag_of(model: mujoco.MjModel, actuator: Actuator) -> list[Unknown]:
+    """The time constant of a filter that the model has."""
+    index, filters = model.actuator(actuator.name).id, (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
+    tau = float(model.actuator_dynprm[index, 0])
+    if int(model.actuator_dyntype[index]) not in map(int, filters) or not tau > 0:
+        return []
+    target, note = f"actuator:{actuator.name}.lag", f"time constant of its filter, {tau:g} s in the model"
+    return [_factor(f"{_word(actuator.name)}_lag", target, 0.2, 5.0, note)]
+
+
 def _factor(name: str, target: str, low: float, high: float, note: str) -> Unknown:
     return Unknown(name, (target,), low, high, True, note)
 
@@ -179,9 +188,9 @@ def _of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes) -> list[Unknown
     )
     word = _word(name)
     rows = (
-        ("damping", _round(max(4 * damping, 0.5 * force / speed)), damping, "viscous friction"),
-        ("frictionloss", _round(max(4 * dry, 0.4 * force)), dry, "dry friction"),
-        ("armature", _round(max(4 * rotor, 0.6 * inertia)), rotor, "inertia of rotor and gears"),
+        ("damping", rounded_up(max(4 * damping, 0.5 * force / speed)), damping, "viscous friction"),
+        ("frictionloss", rounded_up(max(4 * dry, 0.4 * force)), dry, "dry friction"),
+        ("armature", rounded_up(max(4 * rotor, 0.6 * inertia)), rotor, "inertia of rotor and gears"),
     )
     out = [
         Unknown(f"{word}_{field}", (f"{at}.{field}",), 0.0, high, False, f"{what}, {own:g} in the model")
@@ -223,7 +232,7 @@ def _contacts(model: mujoco.MjModel, tops: set[int]) -> list[Unknown]:
     if touching:
         every = (sorted(touching), sorted({s for still in touching.values() for s in still}))
         word, step = _shared(model, [top_of(model, g, tops) for g in touching]), float(model.opt.timestep)
-        spans = {"timeconst": (_round(2 * step), max(0.05, _round(10 * step))), "dampratio": (0.1, 1.5)}
+        spans = {"timeconst": (rounded_up(2 * step), max(0.05, rounded_up(10 * step))), "dampratio": (0.1, 1.5)}
         says = {
             "timeconst": "of the contact: the shorter the harder",
             "dampratio": "of the contact: below 1 it bounces",
@@ -276,12 +285,6 @@ def _shared(model: mujoco.MjModel, bodies: Sequence[int]) -> str:
     names = [model.body(body).name for body in bodies]
     begin = "".join(letters[0] for letters in takewhile(lambda x: len(set(x)) == 1, zip(*names, strict=False)))
     return _word((begin.rstrip("_-. 0123456789") if len(set(names)) > 1 else begin) or next(filter(None, names), ""))
-
-
-def _round(value: float) -> float:
-    """Upwards to two digits."""
-    digits = 10.0 ** (np.floor(np.log10(value)) - 1)
-    return float(f"{np.ceil(value / digits) * digits:.2g}")
 
 
 def _word(name: str) -> str:
@@ -373,24 +376,3 @@ def sprung(unknowns: Sequence[Unknown], beside: Sequence[Unknown], fit: Fit) -> 
                 f"parameter, [{spring.low:g}, {spring.high:.2g}], and its springref"
             )
     return out
-
-
-def delay_of(actuators: Sequence[str], fit: Fit, dt: float) -> tuple[list[Unknown], str]:
-    """The delay as an unknown where one shows, and what is to be said of it; dt in s."""
-    if not actuators or len(fit.delays) < 2:
-        return [], ""
-    at_zero = float(fit.miss[fit.delays.index(0)] ** 2)
-    best, late = fit.best, fit.finer
-    if not best or at_zero - 1 < _TELLING:
-        return [], "commands arrive at once: a delay would not lessen what simulations miss"
-    if best == fit.delays[-1]:
-        why = "which other things than a delay do as well: look at the model and at what drives it; none is asked for"
-        return [], f"the later commands arrive the better, up to the {1e3 * dt * best:.3g} ms that were tried, {why}"
-    high = _round(dt * max(2 * best, best + 3))
-    targets = tuple(f"actuator:{name}.delay" for name in actuators)
-    times, when = float(np.sqrt(at_zero)), f"{1e3 * dt * late:.3g} ms late, {late:.2g} samples"
-    note = f"commands arrive about {when}: without that, simulated windows miss {times:.2f} times as much"
-    if times < _LITTLE:
-        share = 100 * (1 - 1 / times)
-        note = f"commands may arrive about {when}: uncertain, for it explains {share:.1g} % of what simulations miss"
-    return [Unknown("delay", targets, 0.0, high, False, note)], note  # none at all is what the model has

@@ -1,9 +1,10 @@
 """States that nothing measures and that an extension brings into a model: where windows of a log start in them.
 
-They begin at rest: joints where the model has them, a filtered command at the command before the window. How far from
-there they may be stands in the model, as ``<numeric name="joint:NAME.start" data="POSITION VELOCITY"/>`` or
-``<numeric name="actuator:NAME.start" data="ACTIVATION"/>``, standard deviations of a normal prior. Without it the prior
-is that of any state, so wide that each window would pay for a state that is never far from rest.
+They begin at rest: joints where the model has them, a filtered command where the commands before the window have
+brought it. How far from there they may be stands in the model as standard deviations of a normal prior, ``<numeric
+name="joint:NAME.start" data="POSITION VELOCITY"/>`` or ``<numeric name="actuator:NAME.start" data="ACTIVATION"/>``.
+Without it the prior is that of any state, so wide that each window would pay for a state that is never far from rest;
+of filters that a model has itself it is ``UNSETTLED`` of the largest command.
 """
 
 from __future__ import annotations
@@ -11,10 +12,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import mujoco
+import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 
+UNSETTLED = 0.3  # of the largest command: how far a filter may be from where a window starts
 _START = ".start"
+_FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
 
 
 def declare_start(spec: mujoco.MjSpec, owner: str, sd: Sequence[float]) -> None:
@@ -42,19 +46,29 @@ def joints_at_rest(model: mujoco.MjModel) -> frozenset[int]:
 
 
 def activations_at_rest(model: mujoco.MjModel) -> int:
-    """How many activations the model says this of."""
-    return sum(len(declared) for kind, _, declared in _declared(model) if kind == "actuator")
+    """How many activations follow from the commands, or the model says this of."""
+    return sum(len(declared) for kind, _, declared in _declared(model) if kind == "actuator") + len(own_filters(model))
+
+
+def own_filters(model: mujoco.MjModel) -> list[int]:
+    """Ids of the actuators with a filter that no extension has brought."""
+    brought = {index for kind, index, _ in _declared(model) if kind == "actuator"}
+    return [k for k in range(model.nu) if int(model.actuator_dyntype[k]) in _FILTERS and k not in brought]
 
 
 def filtered_commands(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """(actuator, column of the physics state) of each command that goes through a declared filter."""
-    filters = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
-    first = 1 + model.nq + model.nv
-    return [
-        (index, first + int(model.actuator_actadr[index]))
-        for kind, index, _ in _declared(model)
-        if kind == "actuator" and int(model.actuator_dyntype[index]) in filters
-    ]
+    """(actuator, column of the physics state) of each command that goes through a filter."""
+    filters = [k for k in range(model.nu) if int(model.actuator_dyntype[k]) in _FILTERS]
+    return [(k, 1 + model.nq + model.nv + int(model.actuator_actadr[k])) for k in filters]
+
+
+def filtered_command(past: FloatArray, tau: float, timestep: float) -> FloatArray:
+    """Where filters of time constant tau (s) are (A,) after commands (P, A), one a timestep (s), the first for long."""
+    if not tau > 0:
+        return np.asarray(past[-1], float)
+    weights = np.exp(-np.arange(len(past))[::-1] * timestep / tau)
+    weights[0] /= -np.expm1(-timestep / tau)
+    return np.asarray(weights @ past / weights.sum())
 
 
 def _declared(model: mujoco.MjModel) -> list[tuple[str, int, FloatArray]]:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sipe_bayes.calibration.init.draft import Unknown
-from sipe_bayes.calibration.init.fits import Fit
-from sipe_bayes.calibration.init.unknowns import delay_of, sprung, told_apart
+from sipe_bayes.calibration.init.fits import Fit, delay_of
+from sipe_bayes.calibration.init.unknowns import sprung, told_apart
 
 
 @pytest.mark.parametrize(

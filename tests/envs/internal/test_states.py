@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
+
 import mujoco
 import numpy as np
+import pytest
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.envs.internal.states import declare_start, filtered_commands, start_sd
+from sipe_bayes.envs.internal.states import UNSETTLED, declare_start, filtered_command, filtered_commands, start_sd
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
@@ -41,6 +45,32 @@ def test_windows_start_at_the_command_before_them() -> None:
     chain = Chain(StateSpace(), simulator, recorded)
     np.testing.assert_array_equal(chain.reference[:, 5], actions[[0, *range(60)], 1])
     np.testing.assert_allclose(windows.start_precision, np.array([10, 10, 100, 100, 0.3]) ** -2.0)
+
+
+@pytest.mark.parametrize("kind", ["filter", "filterexact"])
+def test_windows_of_a_models_own_filter_start_where_the_commands_have_brought_it(kind: str) -> None:
+    """As simulated from the first command on, to what steps as long as a thirtieth of its time constant differ by."""
+    plain = MACHINES["pendulum"].xml
+    xml = re.sub(r"<motor ([^>]*)/>", rf'<general \1 dyntype="{kind}" dynprm="0.12"/>', plain)
+    lag = Parameter("lag", 0.02, 0.5, targets=("actuator:motor.lag",))
+    simulator = Simulator(MjcfEnvironment.build(xml, [lag], ["motor"], ["joint:hinge.position"]), 1)
+    actions, begun = np.random.default_rng(0).normal(size=(60, 1)), simulator.default_state()
+    begun[3] = actions[0, 0]
+    theta = simulator.space.normalise(np.array([0.12]))
+    run = simulator.rollout(theta[None], actions[None], begun[None], 0.02)
+    assert run.states is not None
+    logs = Trajectories.stack([Trajectory(run.observations[0], actions, 0.02, channels=run.channels)])
+    windows = Windows(Segments(window=0.4), simulator, logs)
+    np.testing.assert_allclose(windows.reference[:, 3], run.states[0, windows.start, 3], atol=0.02)
+    np.testing.assert_allclose(windows.start_precision[2], (UNSETTLED * np.abs(actions).max()) ** -2.0)
+
+
+def test_a_filter_without_a_time_constant_is_at_the_last_command() -> None:
+    past = np.array([[1.0], [2.0], [4.0]])
+    assert filtered_command(past, 0.0, 0.01) == 4.0
+    assert filtered_command(past, 1e-6, 0.01) == 4.0
+    assert filtered_command(past[:1], 0.1, 0.01) == 1.0
+    np.testing.assert_allclose(filtered_command(past, 1e6, 0.01), 1.0, atol=1e-6)  # which has hardly moved yet
 
 
 def test_laws_remember_that_the_motion_has_gone_on() -> None:

@@ -9,12 +9,11 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.envs.internal.states import declare_start
+from sipe_bayes.envs.internal.states import UNSETTLED, declare_start
 from sipe_bayes.structure.extension import Extension, members
 from sipe_bayes.structure.machine import Machine
 
 _LONGEST, _SAMPLES = 0.2, 50  # seconds, or so many samples
-_UNSETTLED = 0.3  # of the largest command: how far the filter may be from the last command where a window starts
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ class Lag(Extension):
     def edit(self, machine: Machine, site: str) -> FilteredCommand:
         """The filter."""
         names = members(site)
-        return FilteredCommand(names, _UNSETTLED * (max(machine.commands[name] for name in names) or 1.0))
+        return FilteredCommand(names, UNSETTLED * (max(machine.commands[name] for name in names) or 1.0))
 
     def imitators(self, site: str) -> tuple[str, ...]:
         """A delay."""
