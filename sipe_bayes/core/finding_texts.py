@@ -42,7 +42,7 @@ def blocking(template: str, row: str = "") -> Text:
 
 
 _LOOKS_LIKE = (
-    "{cause} ({percent:.2g} % of the residual of {channel}), most in {log} between {start:.3g} and {stop:.3g} s"
+    "{cause} ({percent:.3g} % of the residual of {channel}), most in {log} between {start:.3g} and {stop:.3g} s"
 )
 _NOT_NOISE = "the residuals are not noise ({p}): they look like " + _LOOKS_LIKE
 _RIDGE = "{combination} = {value:.4g} ± {width:.1g}{unit} "

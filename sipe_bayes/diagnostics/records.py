@@ -253,7 +253,7 @@ class Misfit:
             log=self.log,
             p=self.p_text,
             cause=self.cause,
-            percent=100 * self.share[self.channel],
+            percent=float(f"{100 * self.share[self.channel]:.2g}"),
             channel=self.channel,
             start=self.start,
             stop=self.stop,
