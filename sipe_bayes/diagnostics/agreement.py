@@ -79,7 +79,7 @@ class Disagreement:
         most = f"{self.parameter} differs most ({estimates})" if says else "only combinations of parameters differ"
         return finding(
             Code.LOGS_DISAGREE_UNEXPLAINED if unexplained else Code.LOGS_DISAGREE,
-            parameters=[self.parameter],
+            parameters=[self.parameter] if says else [],
             p=self.p,
             estimates=estimates,
             most=most,
@@ -216,8 +216,8 @@ def disagreement(space: ParameterSpace, logs: Sequence[LogEstimate]) -> Disagree
     if p_left < THRESHOLDS.logs_disagree:
         named, own = _by_themselves(logs, shared)
     parameter, per_log = space[shared[named]], []
-    for log, theta, sd, known in zip(logs, *own, strict=True):
-        if known < _DETERMINED:
+    for log, theta, sd in zip(logs, *own, strict=True):
+        if sd < _DETERMINED:
             within = float(np.clip(theta, -1.0, 2.0)) if parameter.scale == "log" else float(theta)  # else 1e99
             value, low, high = (float(parameter.value(x)) for x in (within, within - sd, within + sd))
             per_log.append((log.name, value, (high - low) / 2))  # perhaps beyond a bound
@@ -242,7 +242,7 @@ def _by_themselves(logs: Sequence[LogEstimate], shared: Sequence[int]) -> tuple[
     p = scipy.stats.chi2.sf((weight * (means - middle) ** 2).sum(0), np.maximum((weight > 0).sum(0) - 1, 1))
     most = int(np.argmin(p))
     differs = p[most] * len(shared) < THRESHOLDS.logs_disagree
-    return most, (means[:, most], sds[:, most], sds[:, most] if differs else np.full(len(logs), np.inf))
+    return most, (means[:, most], sds[:, most] if differs else np.full(len(logs), np.inf))
 
 
 def marginal(information: FloatArray, kept: Sequence[int]) -> FloatArray:
@@ -263,9 +263,8 @@ def _root(information: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(eigenvalues[determined])[:, None] * axes[:, determined].T)
 
 
-_Own = tuple[FloatArray, FloatArray, FloatArray]
-"""Of a parameter that each log has by itself: estimates (K,), sds (K,) where the others are what they are, and sds (K,)
-without knowing these."""
+_Own = tuple[FloatArray, FloatArray]
+"""Of a parameter that each log has by itself: estimates (K,) and their sds (K,), the common ones being known."""
 
 
 @dataclass(frozen=True)
@@ -293,7 +292,6 @@ def _scatter(roots: list[FloatArray], sought: list[FloatArray], own: int | None 
     low = np.where(weak, np.minimum(axes, 0).sum(0), -np.inf)
     high = np.where(weak, np.maximum(axes, 0).sum(0), np.inf)
     solution = axes @ scipy.optimize.lsq_linear(rows @ axes, target, (low, high), tol=1e-12).x
-    sd = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows + UNIFORM_PRECISION * np.eye(rows.shape[1]))))
     q = float(((rows @ solution - target) ** 2).sum())
     alone = 1 / np.sqrt((rows[:, len(common) :] ** 2).sum(0) + UNIFORM_PRECISION)
-    return _Scatter(q, len(rows) - int((~weak).sum()), (solution[len(common) :], alone, sd[len(common) :]))
+    return _Scatter(q, len(rows) - int((~weak).sum()), (solution[len(common) :], alone))

@@ -329,11 +329,12 @@ class MjcfEnvironment(Environment):
         if model.nhistory == 0 and not filtered and not laws:
             return states
         states, timestep = moving_on(laws, states), np.asarray(timestep)
+        steps = np.broadcast_to(timestep, len(states))
         for index, column in filtered:
-            tau, steps = float(model.actuator_dynprm[index, 0]), np.broadcast_to(timestep, len(actions))
+            control = int(model.actuator_ctrladr[index])
             for row, past in enumerate(actions):
-                command = filtered_command(past, tau, float(steps[row]))
-                states[row, column] = self.control(model, states[row], command)[int(model.actuator_ctrladr[index])]
+                commands = self.control(model, states[row], past)[:, control]
+                states[row, column] = filtered_command(model, index, commands, float(steps[row]))
         start = 1 + model.nq + model.nv + model.na
         for column, actuator in enumerate(self.actuators):
             index = named(model, "actuator", actuator, "actuator")

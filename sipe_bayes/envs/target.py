@@ -115,6 +115,8 @@ def actuator_unit(model: mujoco.MjModel, actuator: int, words: str) -> str:
     if int(model.actuator_trntype[actuator]) not in _JOINTS or int(model.jnt_type[joint]) not in _SINGLE:
         return words
     hinge = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+    if not hinge and abs(float(model.actuator_gear[actuator, 0])) != 1:  # of a spindle or a rack: it has a unit itself
+        return words
     known = _AT_HINGE if hinge else _AT_SLIDE
     top, slash, bottom = words.partition("/")
     if bottom == "command":

@@ -16,7 +16,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.rotations import added, between, bridged, inverse, product, quaternions, rotation_vectors, turned
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.internal.closed_chains import SD, close, dependent_joints, dofs_of
-from sipe_bayes.envs.internal.states import UNSETTLED, activations_at_rest, joints_at_rest, own_filters
+from sipe_bayes.envs.internal.states import activations_at_rest, filtered_commands, joints_at_rest, own_filters, settle
 from sipe_bayes.envs.poses import PoseReading, has_pose, inertial_joints, is_round
 from sipe_bayes.likelihood.state_space.indirect_positions import LogSamples, indirect_positions
 from sipe_bayes.likelihood.state_space.inertial import carried, orientations
@@ -24,6 +24,7 @@ from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.contacts import Contacts, contacts_along, may_touch
 from sipe_bayes.simulation.simulator import Simulator
 
+_LONGEST, _FORGOTTEN = 2000, 10.0  # commands, longer than any delay; time constants after which a filter has forgotten
 STATE_STEP = 1e-5  # rad or m, rad/s or m/s: finite differences by a state
 
 
@@ -282,12 +283,9 @@ def start_sd(simulator: Simulator, trajectories: Trajectories) -> FloatArray:
     for joint in followed_joints(simulator, trajectories):
         dofs = dofs_of(model, joint)
         out[dofs], out[model.nv + dofs] = SD, 10 * SD
-    filters = own_filters(model)
-    if filters:
+    if own_filters(model):
         largest = np.abs(simulator.environment.control(model, np.empty(0), trajectories.actions)).max((0, 1))
-        for k in filters:
-            size = float(largest[int(model.actuator_ctrladr[k])])
-            out[2 * model.nv + int(model.actuator_actadr[k])] = UNSETTLED * (size or 1.0)
+        settle(model, out, largest)
     return out
 
 
@@ -366,22 +364,37 @@ def past_commands(
 
     Of starts at samples ``start`` (W,) of the logs ``log`` (W,), whose control steps take ``dt`` (W,) seconds.
     """
-    longest = 2000 if simulator.model.nhistory or simulator.model.na else 1  # longer than any delay, and most filters
+    slowest = max(
+        (float(simulator.model.actuator_dynprm[k, 0]) for k, _ in filtered_commands(simulator.model)), default=0
+    )
+    longest = np.minimum(np.maximum(np.ceil(_FORGOTTEN * slowest / dt), 1), _LONGEST).astype(np.int64)
+    if simulator.model.nhistory:
+        longest[:] = _LONGEST
     past = []
-    for k, first, seconds in zip(log, start, dt, strict=True):
+    for k, first, seconds, most in zip(log, start, dt, longest, strict=True):
         skip = simulator.physics_steps(float(seconds))[0]
-        rows = trajectories.actions[k, max(0, first - longest) : first]
+        rows = trajectories.actions[k, max(0, first - most) : first]
         past.append(np.repeat(rows, skip, axis=0) if len(rows) else trajectories.actions[k, :1])
     return past
 
 
 def with_history(
-    simulator: Simulator, states: FloatArray, past: list[FloatArray], dt: FloatArray, steps: IntArray | int = 0
+    simulator: Simulator,
+    states: FloatArray,
+    past: list[FloatArray],
+    dt: FloatArray,
+    steps: IntArray | int = 0,
+    recorded: BoolArray | bool = False,
 ) -> FloatArray:
-    """States (W, S) with the ``past_commands`` that delayed actuators remember; dt (W,) in seconds.
+    """States (W, S) with the ``past_commands`` that delayed actuators and filters remember; dt (W,) in seconds.
 
-    They are at time zero, or, where firmware has a clock, ``steps`` (W,) control steps after its start.
+    They are at time zero, or, where firmware has a clock, ``steps`` (W,) control steps after its start. What filters
+    remember is in states that are recorded (W,).
     """
+    columns = [column for _, column in filtered_commands(simulator.model)]
+    own = states[:, columns].copy()
     states[:, 0] = steps * dt if simulator.engine.firmware else 0.0
     timestep = np.array([simulator.physics_steps(float(seconds))[1] for seconds in dt])
-    return simulator.environment.history(simulator.model, states, past, timestep)
+    begun = simulator.environment.history(simulator.model, states, past, timestep)
+    begun[:, columns] = np.where(np.reshape(recorded, (-1, 1)), own, begun[:, columns])
+    return begun

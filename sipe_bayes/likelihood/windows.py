@@ -132,7 +132,8 @@ class Windows:
         reference = np.stack([guesses[k][s] for k, s in zip(self.log, self.start, strict=True)])
         self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
         past = past_commands(simulator, trajectories, self.log, self.start, self.dt)
-        self.reference = with_history(simulator, reference, past, self.dt, self.start)
+        recorded = are_states(simulator, trajectories.states)
+        self.reference = with_history(simulator, reference, past, self.dt, self.start, recorded)
         free = start_sd(simulator, trajectories) if self.settings.starts == "estimated" else np.zeros(0)
         self.num_start, self.start_precision = len(free), free**-2.0
 

@@ -14,7 +14,7 @@ from sipe_bayes.core.findings import Code, Findings
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import BandCoverage, ChannelScore, Comparison
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
-from sipe_bayes.report.words import listed, number
+from sipe_bayes.report.words import listed, number, significant
 
 _ONE = "The one value may be trusted within its interval"
 _NAMED, _DOUBTS = 3, 2  # parameters and doubts that a sentence lists
@@ -60,8 +60,9 @@ def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdic
     problems = [TEXTS[code].row for code in _PROBLEMS if code in codes and code not in allowed]
     if problems:
         return Verdict("bad", ", ".join(problems))
-    if shared:
-        return Verdict("fair", f"only with {listed(others)}")
+    if shared:  # a wider interval that is the prior's says nothing of one alone
+        open_ = parameter.further is not None and _wide(parameter)
+        return Verdict("bad" if open_ else "fair", f"only with {listed(others)}")
     if not parameter.sd > 0:
         return Verdict("fair", "a point without uncertainty")
     if parameter.further is not None and _lacks(findings):
@@ -238,21 +239,23 @@ def lack(calibration: Calibration) -> Verdict | None:
     share = f"{number(100 * misfit.share[channel], 2)} % of the residual of {channel}"
     if not misfit.matters:
         return Verdict("fair", f"The model lacks something small: it looks like {misfit.cause} ({share}).")
-    text = f"The model lacks something: it looks like {misfit.cause} ({share}, {misfit.p_text})"
+    text = f"The model lacks something: it looks like {misfit.cause} ({share}, {misfit.p_text})."
+    text += " `sipe discover` tries it." if misfit.shift else ""
     moved = sorted(misfit.moved, key=lambda name: -abs(misfit.shift[name]))[:_DOUBTS]
     if moved:
         values = [_would_be(calibration, name, misfit.shift[name]) for name in moved]
-        text += f"; with it, to first order, {listed(values)}"
-    return Verdict("bad", f"{text}. `sipe discover` tries it." if misfit.shift else f"{text}.")
+        text += f" With it, to first order, {listed(values)}."
+    return Verdict("bad", text)
 
 
 def _would_be(calibration: Calibration, name: str, sds: float) -> str:
     """Where a parameter would be that moves by so many sds, and where it is."""
     posterior = calibration.posterior
     j = posterior.space.names.index(name)
-    theta, sd, value = float(posterior.mode[j]), float(posterior.stddev[j]), posterior.space[j].value
-    there = float(value(min(max(theta + sds * sd, 0.0), 1.0)))
-    return f"{name} would be about {number(there, 2)}, not {number(float(value(theta)), 2)}"
+    theta, sd, parameter = float(posterior.mode[j]), float(posterior.stddev[j]), posterior.space[j]
+    here, there = (float(parameter.value(x)) for x in (theta, min(max(theta + sds * sd, 0.0), 1.0)))
+    new, old = (significant(x, 10 * abs(there - here), here) for x in (there, here))
+    return f"{name} would be about {new}, not {old} {parameter.unit}".rstrip()
 
 
 def mixing_verdict(calibration: Calibration) -> Verdict | None:

@@ -366,12 +366,12 @@ class StructureSearch:
                     return self._fitted(state, labels, np.concatenate([offer.others, offer.theta]))
         own, close = set(here.labels), [one for one in state.fitted if len(one.labels) == len(here.labels)]
         close = [one for one in close if len(own ^ set(one.labels)) == 2 and not state.is_refused(one.labels)]
-        best = max(close, key=self.total, default=here)
-        if not self.better(best, here):
+        best = max((one for one in close if self.better(one, here)), key=self.total, default=None)
+        if best is None:
             return replace(state, phase=Phase.RESIDUAL)
         if self._speaks_against(state := self._judged(state, best), best):
             return replace(state, refused=(*state.refused, best.labels))
-        return replace(state, present=best.labels)
+        return replace(state, present=best.labels, phase=Phase.PRUNE)
 
     def _residual(self, state: DiscoverState) -> DiscoverState:
         state, ranked = self._ranked(state, state.here, last_resort=True)

@@ -172,10 +172,10 @@ def test_what_the_model_lacks_says_where_values_would_be(calibration: Calibratio
     """P1 is at 0.35 of [1, 2], sd 0.03; what moves by less than a sd is not named, nor where nothing can be told."""
     lacks = judged.lack(dataclasses.replace(calibration, misfit=LACKS))
     assert lacks is not None
-    assert lacks.text.endswith("with it, to first order, p1 would be about 1.4, not 1.3. `sipe discover` tries it.")
+    assert lacks.text.endswith("tries it. With it, to first order, p1 would be about 1.44, not 1.35 kg m^2.")
     far = judged.lack(dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, shift={"p1": 1e3, "p2": -2})))
     assert far is not None
-    assert "p1 would be about 2, not 1.3 and p2 would be about 1.6, not 1.7" in far.text
+    assert "p1 would be about 2.0, not 1.3 kg m^2 and p2 would be about 1.64, not 1.70 kg m^2" in far.text
     coloured = judged.lack(dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, shift={})))
     assert coloured is not None
     assert "would" not in coloured.text

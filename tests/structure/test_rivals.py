@@ -64,7 +64,16 @@ def test_what_was_not_fitted_in_its_round_is_fitted_in_the_place_of_a_kept_piece
             state = search._swap(state) if state.phase is Phase.SWAP else state
     assert sorted(asked) == [("a",), ("d",)]
     assert state.present == ("a", "b")
-    assert state.phase is Phase.RESIDUAL
+    assert state.phase is Phase.PRUNE  # what is kept beside it may have made up for its lack
+
+
+def test_a_rival_that_held_out_pieces_speak_against_hides_none_that_they_do_not() -> None:
+    scores = {"": (0.0, 0.0), "a": (100.0, 10.0), "d": (90.0, 10.0), "ad": (200.0, 20.0)}
+    scores |= {"ab": (220.0, 15.0), "ac": (210.0, 25.0)}
+    fitted = tuple(replace(structure(x, evidence), held_out=held) for x, (evidence, held) in scores.items())
+    fitting: Any = SimpleNamespace(holdout=None, corrected=lambda columns: fitting)
+    state = DiscoverState(Phase.SWAP, fitted, ("a", "d"), ranked=(("a",), ("d",)))
+    assert StructureSearch(fitting, ())._swap(state).present == ("a", "c")
 
 
 @pytest.mark.parametrize(("log_score", "ends_with"), [(50.0, ("b", "d")), (-50.0, ("a", "d")), (None, ("b", "d"))])
@@ -83,7 +92,7 @@ def test_a_rival_takes_the_place_unless_held_out_logs_speak_against_it(
     asked = (("a",), (), ("b",), ("d",))
     state = DiscoverState(Phase.SWAP, fitted, ("a", "d"), judged=judged, ranked=asked)
     for _ in range(2):
-        state = search._swap(state)
+        state = search._swap(replace(state, phase=Phase.SWAP))
     assert state.present == ends_with
     assert state.is_refused(("b", "d")) == (log_score is not None and log_score < 0)
     assert state.phase is Phase.RESIDUAL

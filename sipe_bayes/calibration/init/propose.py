@@ -27,6 +27,7 @@ from sipe_bayes.calibration.init.unknowns import (
     RELATIVE,
     candidates,
     nameless,
+    roomy,
     scale_is_open,
     springs,
     sprung,
@@ -351,6 +352,7 @@ def _unknowns(
     samples = left.finer if late else 0.0
     given = trial.simulator.space.default_theta
     shown = told_apart(unknowns, left, given, scale_is_open(model, machine, draft.readings))
+    shown = [u if u.left_out else roomy(model, u, float(x)) for u, x in zip(shown, left.theta, strict=False)]
     notes = [note] if note and not late else []
     notes += [*nameless(model, touching - {model.body(body).id for body in machine.bodies})]
     lost = trial.unfollowed(replace(trial.given, delay=left.best), left.theta)

@@ -26,7 +26,7 @@ _BEST = 1e-3
 _LONGEST = 60  # physics steps of a control step, beyond which a clock is not believed
 _MOVES = 2.0  # times the noise, that a channel moves which is to be followed
 _UNFOLLOWED = 0.8  # of a straight line's miss
-_PAST = 64  # samples of commands before a window
+_PAST = 500  # samples of commands before a window
 _STEPS = 200  # physics steps, on average, of each window that is asked for
 
 
@@ -160,7 +160,8 @@ class Trial:
             actions = _driven_as(log, assumption)
             commands.append(actions[places[:, None] + np.arange(self.length)])
             skip = self.simulator.physics_steps(log.dt)[0]
-            past += [np.repeat(actions[max(0, s - _PAST) : s + 1], skip, axis=0) for s in places]
+            before = [actions[max(0, s - _PAST) : s] if s else actions[:1] for s in places]
+            past += [np.repeat(rows, skip, axis=0) for rows in before]
         flight = self._read[key]
         begun = with_history(self.simulator, flight.states.copy(), past, flight.dt)
         return replace(flight, states=begun, commands=np.concatenate(commands))

@@ -156,7 +156,9 @@ def _lag_of(model: mujoco.MjModel, actuator: Actuator) -> list[Unknown]:
     if int(model.actuator_dyntype[index]) not in map(int, filters) or not tau > 0:
         return []
     target, note = f"actuator:{actuator.name}.lag", f"time constant of its filter, {tau:g} s in the model"
-    return [_factor(f"{_word(actuator.name)}_lag", target, 0.2, 5.0, note)]
+    unknown = _factor(f"{_word(actuator.name)}_lag", target, 0.2, 5.0, note)
+    low = max(unknown.low, _least(model, unknown))  # of Euler's steps a step
+    return [replace(unknown, low=low)] if low < 1 else []
 
 
 def _factor(name: str, target: str, low: float, high: float, note: str) -> Unknown:
@@ -311,8 +313,7 @@ def as_parameters(model: mujoco.MjModel, unknowns: Sequence[Unknown]) -> list[Pa
 def told_apart(unknowns: Sequence[Unknown], fit: Fit, given: FloatArray, open_scale: bool = False) -> list[Unknown]:
     """The unknowns, with the reason where one is better left out: it shows too little, or as another one does.
 
-    Bounds that the fit presses against are widened. One that shows as others do is kept where leaving it at the model's
-    own value would cost more than noise.
+    One that shows as others do is kept where leaving it at the model's own value would cost more than noise.
 
     Args:
         unknowns: of the fit, those first that are to be kept first.
@@ -348,20 +349,29 @@ def told_apart(unknowns: Sequence[Unknown], fit: Fit, given: FloatArray, open_sc
             reason = f"{_MOST} are enough to begin with"
         if not reason:
             kept.append(k)
-        out.append(replace(unknown if reason else _roomy(unknown, float(fit.theta[k])), left_out=reason))
+        out.append(replace(unknown, left_out=reason))
     return out
 
 
-def _roomy(unknown: Unknown, theta: float) -> Unknown:
-    """An unknown whose bounds leave room where the fit pressed against one; what is positive stays so."""
+def roomy(model: mujoco.MjModel, unknown: Unknown, theta: float) -> Unknown:
+    """An unknown whose bounds leave room where a fit of windows pressed against one; no lower ones of contacts."""
     low, high = unknown.low, unknown.high
-    if theta < _PRESSED:
-        low = low / _BEYOND if low > 0 else low * _BEYOND
+    if theta < _PRESSED and low > 0 and not any(target.startswith("geom:") for target in unknown.targets):
+        low = max(low / _BEYOND, _least(model, unknown))
+    elif theta < _PRESSED and low < 0:
+        low *= _BEYOND
     if theta > 1 - _PRESSED:
         high *= _BEYOND
-    changed = (low, high) != (unknown.low, unknown.high)
+    if (low, high) == (unknown.low, unknown.high):
+        return unknown
     note = f"{unknown.note}; bounds wider, since simulated windows press against the usual one"
-    return replace(unknown, low=float(f"{low:.2g}"), high=float(f"{high:.2g}"), note=note) if changed else unknown
+    return replace(unknown, low=float(f"{low:.2g}"), high=float(f"{high:.2g}"), note=note)
+
+
+def _least(model: mujoco.MjModel, unknown: Unknown) -> float:
+    """The least that its targets may be, in terms of what they are where bounds are."""
+    bound = [bind(model, target) for target in unknown.targets if not of_sensor(target)]
+    return max((1.01 * t.minimum / (t.value if unknown.relative else 1.0) for t in bound), default=-np.inf)
 
 
 def sprung(unknowns: Sequence[Unknown], beside: Sequence[Unknown], fit: Fit) -> list[str]:

@@ -56,19 +56,37 @@ def own_filters(model: mujoco.MjModel) -> list[int]:
     return [k for k in range(model.nu) if int(model.actuator_dyntype[k]) in _FILTERS and k not in brought]
 
 
+def settle(model: mujoco.MjModel, sd: FloatArray, largest: FloatArray) -> None:
+    """Write into prior sds (2 nv + na,) of a start those of the model's own filters; largest: (nu,) of commands."""
+    for k in own_filters(model):
+        control = int(model.actuator_ctrladr[k])
+        size = float(largest[control])
+        if model.actuator_ctrllimited[control]:
+            size = min(size, float(np.abs(model.actuator_ctrlrange[control]).max()))
+        sd[2 * model.nv + int(model.actuator_actadr[k])] = UNSETTLED * (size or 1.0)
+
+
 def filtered_commands(model: mujoco.MjModel) -> list[tuple[int, int]]:
     """(actuator, column of the physics state) of each command that goes through a filter."""
     filters = [k for k in range(model.nu) if int(model.actuator_dyntype[k]) in _FILTERS]
     return [(k, 1 + model.nq + model.nv + int(model.actuator_actadr[k])) for k in filters]
 
 
-def filtered_command(past: FloatArray, tau: float, timestep: float) -> FloatArray:
-    """Where filters of time constant tau (s) are (A,) after commands (P, A), one a timestep (s), the first for long."""
-    if not tau > 0:
-        return np.asarray(past[-1], float)
-    weights = np.exp(-np.arange(len(past))[::-1] * timestep / tau)
-    weights[0] /= -np.expm1(-timestep / tau)
-    return np.asarray(weights @ past / weights.sum())
+def filtered_command(model: mujoco.MjModel, actuator: int, past: FloatArray, timestep: float) -> float:
+    """Where an actuator's filter is after commands (P,), one a timestep (s), the first of them held for long before."""
+    control, tau = int(model.actuator_ctrladr[actuator]), float(model.actuator_dynprm[actuator, 0])
+    late = round(float(model.actuator_delay[actuator]) / timestep)
+    past = past[: max(1, len(past) - late)]
+    if model.actuator_ctrllimited[control]:
+        past = np.clip(past, *model.actuator_ctrlrange[control])
+    weights = np.zeros(len(past))
+    weights[-1] = 1.0
+    if tau > 0:
+        weights = np.exp(-np.arange(len(past))[::-1] * timestep / tau)
+        weights[0] /= -np.expm1(-timestep / tau)
+    value = float(weights @ past / weights.sum())
+    limited = bool(model.actuator_actlimited[actuator])
+    return float(np.clip(value, *model.actuator_actrange[actuator])) if limited else value
 
 
 def _declared(model: mujoco.MjModel) -> list[tuple[str, int, FloatArray]]:

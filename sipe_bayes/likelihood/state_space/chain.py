@@ -85,7 +85,7 @@ class Chain:
         if known:
             reference[self.first] = trajectories.states[:, 0]  # type: ignore[index]
         past = past_commands(simulator, trajectories, self.log, self.sample, self.dt)
-        self.reference = with_history(simulator, reference, past, self.dt, self.sample)
+        self.reference = with_history(simulator, reference, past, self.dt, self.sample, self.first & known)
         self.sizes = (model.nv, model.nv, model.na)
         sd = np.repeat(KNOWN_SD, self.sizes) if known else start_sd(simulator, trajectories)
         self.prior_precision = np.where(self.first[:, None], sd**-2.0, 0.0)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 
 from sipe_bayes.calibration.init.draft import Unknown
 from sipe_bayes.calibration.init.fits import Fit, delay_of
-from sipe_bayes.calibration.init.unknowns import sprung, told_apart
+from sipe_bayes.calibration.init.unknowns import roomy, sprung, told_apart
 
 
 @pytest.mark.parametrize(
@@ -38,18 +39,30 @@ def test_what_is_nearly_the_same_is_asked_for_where_the_logs_tell_it(
     assert (not second.left_out) is kept, second.left_out
 
 
+FILTERED = """<mujoco><option timestep="0.002"/><worldbody><body name="arm"><joint name="hinge" axis="0 1 0"/>
+    <geom size=".1" mass="1"/><body name="payload"><geom name="tip" size=".1" mass=".2"/></body></body></worldbody>
+    <actuator><general name="drive" joint="hinge" dyntype="filter" dynprm="0.02"/></actuator></mujoco>"""
+
+
 @pytest.mark.parametrize(
-    ("theta", "low", "high"),
-    [(0.5, 0.5, 2.0), (1.0, 0.5, 6.0), (0.0, 0.17, 2.0)],
+    ("target", "relative", "bounds", "theta", "wider"),
+    [
+        ("body:payload.mass", True, (0.5, 2.0), 0.5, (0.5, 2.0)),
+        ("body:payload.mass", True, (0.5, 2.0), 1.0, (0.5, 6.0)),
+        ("body:payload.mass", True, (0.5, 2.0), 0.0, (0.17, 2.0)),
+        ("joint:hinge.damping", False, (0.0, 1.0), 0.0, (0.0, 1.0)),  # none is none
+        ("joint:hinge.springref", False, (-0.2, 0.2), 0.0, (-0.6, 0.2)),
+        ("actuator:drive.lag", True, (0.2, 5.0), 0.0, (0.1, 5.0)),  # no shorter than a physics step
+        ("geom:tip.friction", False, (0.3, 1.5), 0.0, (0.3, 1.5)),
+    ],
 )
-def test_bounds_that_the_fit_presses_against_are_widened(theta: float, low: float, high: float) -> None:
-    unknown = Unknown("payload", (), 0.5, 2.0, True, "0.2 kg in the model")
-    fit = Fit((0,), np.ones(1), np.array([theta]), np.full((400, 1), 5.0), np.ones(1))
-    (kept,) = told_apart([unknown], fit, np.full(1, 0.3))
-    assert (kept.low, kept.high) == pytest.approx((low, high), abs=0.01)
-    assert ("wider" in kept.note) is (theta != 0.5)
-    friction = told_apart([Unknown("friction", (), 0.0, 1.0, False, "")], fit, np.zeros(1))[0]
-    assert friction.low == 0
+def test_bounds_that_a_fit_presses_against_are_widened(
+    target: str, relative: bool, bounds: tuple[float, float], theta: float, wider: tuple[float, float]
+) -> None:
+    unknown = Unknown("it", (target,), *bounds, relative, "as in the model")
+    kept = roomy(mujoco.MjModel.from_xml_string(FILTERED), unknown, theta)
+    assert (kept.low, kept.high) == pytest.approx(wider, abs=0.01)
+    assert ("wider" in kept.note) is (wider != bounds)
 
 
 @pytest.mark.parametrize(("miss", "asked"), [([1.4, 1.1, 1.0, 1.2], True), ([1.5, 1.04, 1.02, 1.0], False)])

@@ -47,30 +47,59 @@ def test_windows_start_at_the_command_before_them() -> None:
     np.testing.assert_allclose(windows.start_precision, np.array([10, 10, 100, 100, 0.3]) ** -2.0)
 
 
-@pytest.mark.parametrize("kind", ["filter", "filterexact"])
-def test_windows_of_a_models_own_filter_start_where_the_commands_have_brought_it(kind: str) -> None:
-    """As simulated from the first command on, to what steps as long as a thirtieth of its time constant differ by."""
-    plain = MACHINES["pendulum"].xml
-    xml = re.sub(r"<motor ([^>]*)/>", rf'<general \1 dyntype="{kind}" dynprm="0.12"/>', plain)
-    lag = Parameter("lag", 0.02, 0.5, targets=("actuator:motor.lag",))
+def filtered(kind: str = "filterexact", more: str = "", tau: float = 0.12) -> str:
+    """A pendulum whose motor has a filter, or more."""
+    own = rf'<general \1 dyntype="{kind}" dynprm="{tau}" {more}/>'
+    return re.sub(r"<motor ([^>]*)/>", own, MACHINES["pendulum"].xml)
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "more"),
+    [
+        ("filter", ""),
+        ("filterexact", ""),
+        ("filterexact", 'ctrlrange="-.3 .3"'),
+    ],
+)
+def test_windows_of_a_models_own_filter_start_where_the_commands_have_brought_it(
+    kind: str, more: str, recorded: bool
+) -> None:
+    """As simulated from the first command on, to what steps as long as a thirtieth of its time constant differ by.
+
+    Recorded states say it exactly, also of a filter that is another one.
+    """
+    lag, xml = Parameter("lag", 0.02, 0.5, targets=("actuator:motor.lag",)), filtered(kind, more)
     simulator = Simulator(MjcfEnvironment.build(xml, [lag], ["motor"], ["joint:hinge.position"]), 1)
     actions, begun = np.random.default_rng(0).normal(size=(60, 1)), simulator.default_state()
-    begun[3] = actions[0, 0]
-    theta = simulator.space.normalise(np.array([0.12]))
-    run = simulator.rollout(theta[None], actions[None], begun[None], 0.02)
+    begun[3] = filtered_command(simulator.model, 0, actions[:1, 0], 0.004)
+    tau = 0.3 if recorded else 0.12
+    run = simulator.rollout(simulator.space.normalise(np.array([tau]))[None], actions[None], begun[None], 0.02)
     assert run.states is not None
-    logs = Trajectories.stack([Trajectory(run.observations[0], actions, 0.02, channels=run.channels)])
+    states = run.states[0] if recorded else None
+    logs = Trajectories.stack([Trajectory(run.observations[0], actions, 0.02, states=states, channels=run.channels)])
     windows = Windows(Segments(window=0.4), simulator, logs)
-    np.testing.assert_allclose(windows.reference[:, 3], run.states[0, windows.start, 3], atol=0.02)
-    np.testing.assert_allclose(windows.start_precision[2], (UNSETTLED * np.abs(actions).max()) ** -2.0)
+    np.testing.assert_allclose(
+        windows.reference[:, 3], run.states[0, windows.start, 3], atol=1e-12 if recorded else 0.02
+    )
+    largest = 0.3 if "ctrlrange" in more else np.abs(actions).max()
+    np.testing.assert_allclose(windows.start_precision[2], (UNSETTLED * largest) ** -2.0)
 
 
-def test_a_filter_without_a_time_constant_is_at_the_last_command() -> None:
-    past = np.array([[1.0], [2.0], [4.0]])
-    assert filtered_command(past, 0.0, 0.01) == 4.0
-    assert filtered_command(past, 1e-6, 0.01) == 4.0
-    assert filtered_command(past[:1], 0.1, 0.01) == 1.0
-    np.testing.assert_allclose(filtered_command(past, 1e6, 0.01), 1.0, atol=1e-6)  # which has hardly moved yet
+def test_where_a_filter_is_after_commands() -> None:
+    past = np.array([1.0, 2.0, 4.0])
+
+    def after(past: np.ndarray, more: str = "", tau: float = 0.12) -> float:
+        return filtered_command(mujoco.MjModel.from_xml_string(filtered(more=more, tau=tau)), 0, past, 0.01)
+
+    assert after(past, tau=0.0) == 4.0
+    assert after(past, tau=1e-6) == 4.0
+    assert after(past[:1]) == 1.0
+    np.testing.assert_allclose(after(past, tau=1e6), 1.0, atol=1e-6)  # which has hardly moved yet
+    assert after(past, 'delay="0.01" nsample="20"', tau=0.0) == 2.0
+    assert after(past, 'ctrlrange="-3 3"', tau=0.0) == 3.0
+    assert after(past, 'actrange="-.5 .5"') == 0.5
+    assert after(past, 'delay="0.08" nsample="40"', tau=0.0) == 1.0
 
 
 def test_laws_remember_that_the_motion_has_gone_on() -> None:

@@ -250,7 +250,8 @@ def _called_as_actuators(machine: Machine, labels: list[Label], become: Mapping[
 
     def drives(label: Label) -> bool:
         family = label.kind is Kind.UNKNOWN and label.number is not None  # of such there is doubt
-        named = called(label, undriven) > max(_CALLED, called(label, joints))
+        whole = [name for name in undriven if tuple(pieces_of(name)) == label.words and name not in joints]
+        named = bool(whole) or called(label, undriven) > max(_CALLED, called(label, joints))
         return label.kind in become and not family and not label.measured and named
 
     return [replace(x, kind=become[x.kind]) if drives(x) else x for x in labels]
