@@ -50,6 +50,7 @@ def suggest(
         from sipe_bayes.calibration.problem import prepare
         from sipe_bayes.core.files import to_json
         from sipe_bayes.diagnostics import suggest as suggestions
+        from sipe_bayes.report.words import listed
 
         whole("--candidates", candidates, 0)
         whole("--seed", seed, 0)
@@ -71,18 +72,27 @@ def suggest(
             raise ValueError("--candidates: expected at least 1, or --given; got none")
         known, noise = _known(problem, posterior), _noise(problem, posterior)
         model = problem.simulator, problem.segments
-        ranked = suggestions.rank(*model, plans, noise, known, parameter or (), draws=draws, seed=seed)
+        seen = np.concatenate([log.observations for log in problem.train])
+        reached = np.stack([np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)], axis=1)
+        ranked = suggestions.rank(*model, plans, noise, known, parameter or (), reached=reached, draws=draws, seed=seed)
         _write(problem, ranked[0].plan, out)
     if as_json:
         print(to_json({**suggestions.to_dict(ranked, problem.simulator, parameter or ()), "out": str(out)}))
         return
-    space, channels = problem.simulator.space, problem.simulator.environment.channels
+    environment, space = problem.environment, problem.simulator.space
+    units = dict(zip(environment.channels, environment.channel_units, strict=True))
     for one in ranked[:_SHOWN]:
         each = ", ".join(f"{name} {one.contraction[space.index(name)]:.2f}" for name in parameter or space.names)
-        reach = ", ".join(f"{name} {a:.3g} to {b:.3g}" for name, (a, b) in zip(channels, one.reach, strict=True))
+        reach = ", ".join(f"{c} {a:.3g} to {b:.3g} {units[c]}" for c, (a, b) in zip(units, one.reach, strict=True))
         lost = f"; diverges at {one.diverged} of {draws} draws" if one.diverged else ""
-        print(f"{one.score:.3f}  {one.plan.name}: expected contraction {each}; reaches {reach}{lost}")
-    print(f"the first one is in {out}; check what it reaches before it runs on the machine")
+        far = f"; far beyond the logs in {listed([list(units)[c] for c in one.strays])}" if one.strays else ""
+        print(f"{one.score:.3f}  {one.plan.name}: expected contraction {each}; reaches {reach}{far}{lost}")
+    if ranked[0].strays:
+        print(
+            f"the first one is in {out}; NOT to be run as it is: each takes the machine far beyond where the logs were"
+        )
+    else:
+        print(f"the first one is in {out}; check what it reaches before it runs on the machine")
 
 
 def _check_amount(candidates: int, duration: float, dt: float) -> None:

@@ -11,8 +11,9 @@ given, or generated within each actuator's limits:
   drawn).
 
 A candidate ends as it began, within a tenth of its duration, at zero or the middle of the limits. One that diverges at
-a draw counts there as telling nothing. What each candidate makes the measured quantities reach is stated, for whether
-the machine may go there is not known here.
+a draw counts there as telling nothing. Whether the machine may go where a candidate takes it is not known here; so what
+each reaches is stated, and those that take a measured quantity further than logs went, by more than half of what that
+was in all, come after those that do not and tell half as much as the best at least.
 """
 
 from __future__ import annotations
@@ -41,6 +42,8 @@ class SequenceOptions(Options):
 
     sizes: tuple[float, ...] = option((1.0, 0.5, 0.25), "in turn", "of the limits")
     sines: int = option(10, "at most, in a sum", least=1)
+    beyond: float = option(0.5, "of what logs reached of a channel, beyond which a sequence strays", above=0)
+    worth: float = option(0.5, "of the best score, from which a sequence that does not stray goes before", least=0)
     edge: float = option(0.05, "at either end, over which it begins and ends", "of the duration", above=0)
 
 
@@ -57,6 +60,7 @@ class Suggestion:
         contraction: (N,) expected of each parameter's sd.
         reach: (C, 2) lowest and highest value of each channel over the draws.
         diverged: at how many of the draws.
+        strays: numbers of the channels that go far beyond what logs reached.
     """
 
     plan: Plan
@@ -64,6 +68,7 @@ class Suggestion:
     contraction: FloatArray
     reach: FloatArray
     diverged: int
+    strays: tuple[int, ...] = ()
 
 
 def rank(
@@ -74,11 +79,12 @@ def rank(
     known: Posterior,
     names: Sequence[str] = (),
     *,
+    reached: FloatArray | None = None,
     draws: int = 4,
     seed: int = 0,
     tell: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[Suggestion]:
-    """Plans, the most telling first.
+    """Plans, the most telling first of those that do not stray, then the others.
 
     Args:
         simulator: of the model.
@@ -87,6 +93,7 @@ def rank(
         noise: (C,) of the fitted channels.
         known: the prior, or the posterior so far.
         names: of the parameters that count; default all that are not of one log.
+        reached: (C, 2) lowest and highest value of each channel in logs; default none, of which nothing strays.
         draws: of ``known``, over which the gain is averaged.
         seed: of the draws.
         tell: called with how many plans are done, and of how many.
@@ -110,8 +117,18 @@ def rank(
         gains = informations(simulator, likelihood, plan, noise, thetas)
         lost = draws - len(gains)
         gain = contraction(precision, gains + [nothing] * lost)
-        ranked.append(Suggestion(plan, float(gain[wanted].mean()), gain, _reach(simulator, plan, thetas), lost))
-    return sorted(ranked, key=lambda one: -one.score)
+        reach = _reach(simulator, plan, thetas)
+        far = () if reached is None else _strays(reach, reached)
+        ranked.append(Suggestion(plan, float(gain[wanted].mean()), gain, reach, lost, far))
+    worth = _OPTIONS.worth * max((one.score for one in ranked), default=0.0)
+    return sorted(ranked, key=lambda one: (bool(one.strays) or one.score < worth, -one.score))
+
+
+def _strays(reach: FloatArray, reached: FloatArray) -> tuple[int, ...]:
+    """Numbers of the channels of which a reach (C, 2) goes far beyond another."""
+    room = _OPTIONS.beyond * np.diff(reached, axis=1)[:, 0]
+    far = (reach[:, 0] < reached[:, 0] - room) | (reach[:, 1] > reached[:, 1] + room) | ~np.isfinite(reach).all(1)
+    return tuple(np.flatnonzero(far & np.isfinite(reached).all(1)).tolist())
 
 
 def _reach(simulator: Simulator, plan: Plan, thetas: FloatArray) -> FloatArray:
@@ -225,6 +242,7 @@ def to_dict(suggestions: Sequence[Suggestion], simulator: Simulator, names: Sequ
                 "contraction": dict(zip(space.names, one.contraction.tolist(), strict=True)),
                 "reach": dict(zip(channels, one.reach.tolist(), strict=True)),
                 "diverged": one.diverged,
+                "strays": [channels[c] for c in one.strays],
             }
             for one in suggestions
         ],

@@ -70,7 +70,7 @@ def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdic
     if Code.AT_PHYSICAL_BOUND in codes and not findings.blocking:
         return Verdict("good", f"{TEXTS[Code.AT_PHYSICAL_BOUND].row}, at most the upper end")
     partly = f"; {TEXTS[Code.DEAD_RANGE].row}" if Code.DEAD_RANGE in codes else ""
-    if parameter.contraction < THRESHOLDS.well_determined or _wide(parameter):
+    if parameter.contraction < THRESHOLDS.well_determined or _wide(parameter, THRESHOLDS.well_determined):
         return Verdict("fair", "weakly determined" + partly)
     doubted = "; doubted above" if findings.blocking else ""
     return Verdict("fair" if partly or doubted else "good", "determined" + partly + doubted)
@@ -94,11 +94,11 @@ def _with_what_is_lacking(parameter: ParameterSummary, findings: Findings) -> Ve
     return Verdict("fair", "within the wider interval" + doubted)
 
 
-def _wide(parameter: ParameterSummary) -> bool:
-    """Whether the wider interval, if there is one, says little more than the prior."""
+def _wide(parameter: ParameterSummary, contraction: float = THRESHOLDS.not_determined) -> bool:
+    """Whether the wider interval, if there is one, contracts less than so far from the prior's."""
     low, high = parameter.further or (0.0, 0.0)
     prior = _FIVE_TO_95 * parameter.sd / max(1 - parameter.contraction, 1e-12)
-    return not (high - low) < (1 - THRESHOLDS.not_determined) * prior
+    return not (high - low) < (1 - contraction) * prior
 
 
 def _doubts(findings: Findings, parameters: Sequence[ParameterSummary]) -> list[str]:

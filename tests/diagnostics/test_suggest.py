@@ -61,6 +61,25 @@ def test_the_suggested_experiment_beats_random_ones() -> None:
     assert order > 0.7
 
 
+def test_what_takes_the_machine_far_beyond_its_logs_comes_last() -> None:
+    """Whatever it tells: the small ones stay within what a small one reached, the large ones do not."""
+    simulator = pendulum()
+    plans = generate(12, 2.0, DT, BOUNDS, (0.5, 5.0), seed=1)
+    known = simulator, SEGMENTS, plans, NOISE, prior(simulator.space)
+    plain = rank(*known, draws=2)
+    assert not any(one.strays for one in plain)
+    near = min(plain, key=lambda one: float(np.ptp(one.reach, axis=1)[0])).reach
+    ranked = rank(*known, reached=near, draws=2)
+    strays = [bool(one.strays) for one in ranked]
+    assert 0 < sum(strays) < len(strays)
+    last = [one.strays or one.score < 0.5 * max(other.score for other in ranked) for one in ranked]
+    assert [bool(x) for x in last] == sorted(bool(x) for x in last)
+    assert not ranked[0].strays
+    for one in ranked:
+        beyond = max(near[0, 0] - one.reach[0, 0], one.reach[0, 1] - near[0, 1])
+        assert (one.strays == (0,)) == (beyond > 0.5 * float(np.ptp(near, axis=1)[0]))
+
+
 def test_a_narrow_band_holds_every_kind() -> None:
     """No multiple of 1 / duration lies in it."""
     for plan in generate(8, 5.0, 0.01, BOUNDS, (0.3, 0.35)):
