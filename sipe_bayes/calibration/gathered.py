@@ -17,6 +17,7 @@ from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.evaluate import compare_errors
+from sipe_bayes.diagnostics.identifiability import worth_measuring
 from sipe_bayes.diagnostics.records import ChannelScore, LogReport, Ridge, improvement
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -85,6 +86,14 @@ class Marginals:
         draws = posterior.values(_DRAWS, generator=torch.Generator().manual_seed(seed))
         return cls(posterior.space, most_probable(posterior), sd, contraction, draws, natural)
 
+    def worth_measuring(self) -> list[Finding]:
+        """The one parameter on which most of the others hang, if there is one."""
+        one = worth_measuring(self.space, self.draws, self.contraction.tolist())
+        if one is None:
+            return []
+        name, others = one
+        return [finding(Code.WORTH_MEASURING, parameters=[name], count=len(others), others=", ".join(others))]
+
     def summaries(self, further: Posterior | None = None) -> list[ParameterSummary]:
         """One for each parameter.
 
@@ -128,7 +137,8 @@ class Marginals:
         on_ridge = {name for ridge in ridges for name in ridge.parameters}
         noticed, near = [], self._near
         for j, p in enumerate(self.space):
-            about = functools.partial(finding, parameters=[p.name], unit=p.unit)
+            unit = "" if p.unit in ("", "1") else f" {p.unit}"
+            about = functools.partial(finding, parameters=[p.name], unit=unit)
             pieces = dead.get(p.name, [])
             idle = any(low <= 0 and high >= 1 for low, high in pieces)
             if idle:

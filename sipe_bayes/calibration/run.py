@@ -91,6 +91,7 @@ def calibrate(
         *outside.findings,
         *uneven_targets(problem.environment),
         *([] if conflict is None else [conflict.finding]),
+        *marginals.worth_measuring(),
         *(ridge.finding(Code.RIDGE_TO_RESOLVE) for ridge in combinations),
         *marginals.findings(ranges_that_change_nothing(fit, checks), combinations),
         *predictions.findings(),

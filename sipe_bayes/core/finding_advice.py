@@ -141,6 +141,10 @@ ADVICE: dict[Code, str] = {
     ),
     Code.RIDGE: "Only the combination acts on the motion. Use it, not its members.",
     Code.RIDGE_TO_RESOLVE: "Weigh, measure or look up one member, and take it out of the unknowns.",
+    Code.WORTH_MEASURING: (
+        "Weigh or measure it by other means, write its value into the model and take it out of the unknowns: it is the "
+        "one on which most of the others hang. The more exactly it is known, the more exactly they are."
+    ),
     Code.RIDGE_EXPECTED: "The planned motion would tell the combination alone. Plan another, or fix a member.",
     Code.NEVER_EXCITED: "The planned motion does not touch it.",
     Code.NOT_DETERMINED_EXPECTED: "Send more, longer or faster motion of what it acts on.",

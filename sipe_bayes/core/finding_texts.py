@@ -221,21 +221,22 @@ class Code(Enum):
 
     # parameters
     NO_EFFECT = caution("{parameters} changes nothing in these logs; its posterior is its prior", "changes nothing")
-    DEAD_RANGE = caution("{parameters} changes nothing between {ranges} {unit}", "part of its range changes nothing")
+    DEAD_RANGE = caution("{parameters} changes nothing between {ranges}{unit}", "part of its range changes nothing")
     NOT_DETERMINED = caution(
         "{parameters} is not determined by these logs (contraction {contraction:.2f})", "not determined"
     )
     MODE_AT_BOUND = caution(
-        "{parameters} is at its bound {bound:.4g} {unit}: widen it, unless the bound is physical", "at a bound"
+        "{parameters} is at its bound {bound:.4g}{unit}: widen it, unless the bound is physical", "at a bound"
     )
     AT_PHYSICAL_BOUND = Text(
         Severity.NOTE,
-        "{parameters} is at {bound:.4g} {unit}, and can not be smaller: the logs show none of it up to the upper end "
+        "{parameters} is at {bound:.4g}{unit}, and can not be smaller: the logs show none of it up to the upper end "
         "of its interval",
         "none shows",
     )
     RIDGE = note(_RIDGE + "is determined; {alone} not")
     RIDGE_TO_RESOLVE = caution("{ridge}: fix one of them at a measured value")
+    WORTH_MEASURING = caution("a measured value of {parameters} would determine {count} more: {others}")
     RIDGE_EXPECTED = caution(_RIDGE + "would be determined; {alone} not")
     NEVER_EXCITED = caution("{parameters} is never excited: its posterior will be what is known now")
     NOT_DETERMINED_EXPECTED = caution("{parameters} would not be determined (expected contraction {contraction:.2f})")
@@ -356,7 +357,7 @@ class Code(Enum):
     )
     NOT_EXPORTED = caution("{reason}")
     BIAS_NOT_EXPORTED = caution(
-        "identified.xml has no place for what a sensor does, {parameters!r}; take it off the measurement"
+        "the MJCF that is written has no place for what a sensor does, {parameters!r}; take it off the measurement"
     )
 
     # amortised: methods that learn from simulations of the prior

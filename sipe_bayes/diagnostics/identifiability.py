@@ -1,5 +1,7 @@
 """What the data cannot say: parameters that change nothing, ranges that are dead, directions left open.
 
+And which one value, measured by other means, would tell most of the rest.
+
 A ridge is a direction of small posterior variance in a space where the parameters one by one have large variance: the
 smallest principal components of the posterior's correlation matrix. It is described as a sum or, in logarithms, as a
 product (gear / mass, mass * length^2), whichever is the narrower.
@@ -19,6 +21,7 @@ from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.likelihood.windows import Windows
 
 GRID = (0.0, 0.25, 0.5, 0.75, 1.0)  # of theta, where parameters are tried
+_SEVERAL = 2  # parameters that a measured value has to tell beside itself
 _LOOKED_AT = 2000  # control steps: what does something there is not asked again of all windows
 UNIFORM_PRECISION = 12.0  # of theta under a uniform prior
 
@@ -95,6 +98,39 @@ def ridges(space: ParameterSpace, draws: FloatArray, contraction: Sequence[float
                 used.append(set(ridge.parameters))
                 seen.append(ridge)
     return seen
+
+
+def worth_measuring(
+    space: ParameterSpace, draws: FloatArray, contraction: Sequence[float]
+) -> tuple[str, tuple[str, ...]] | None:
+    """The one parameter whose measured value would determine most of those that are not, and which these are.
+
+    As of a normal, of logarithms where nothing changes sign: what is known of k shrinks by (1 - rho^2)^(1/2), rho its
+    correlation with the one that is measured. A mass, which a scale tells, comes before what tells one more.
+
+    Args:
+        space: of the N parameters.
+        draws: (n, N) of the posterior, in units.
+        contraction: (N,) 1 - sd / prior sd of each.
+
+    Returns:
+        None where it would be fewer than two others.
+    """
+    steady = np.abs(np.sign(draws).sum(0)) == len(draws)
+    views = draws, np.where(steady, np.log(np.maximum(np.abs(draws), 1e-300)), draws)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        square = np.nan_to_num(np.maximum(*(np.corrcoef(view.T) ** 2 for view in views)))
+    left = 1 - np.asarray(contraction)
+    would = left * np.sqrt(np.maximum(1 - square, 0.0)) < 1 - THRESHOLDS.well_determined
+    opened = left >= 1 - THRESHOLDS.well_determined
+    told = would & opened & ~np.eye(len(left), dtype=bool)  # row: what is measured
+    told[[p.log is not None for p in space] | ~opened] = False
+    mass = np.array([bool(p.targets) and all(target.endswith(".mass") for target in p.targets) for p in space])
+    many = told.sum(1) >= _SEVERAL
+    best = int(np.argmax(np.where(many, told.sum(1) + 1.5 * mass, 0.0)))
+    if not many[best]:
+        return None
+    return space[best].name, tuple(space[k].name for k in np.flatnonzero(told[best]).tolist())
 
 
 def _members(loadings: FloatArray) -> IntArray:
