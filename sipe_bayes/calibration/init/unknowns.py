@@ -382,7 +382,7 @@ def sprung(unknowns: Sequence[Unknown], beside: Sequence[Unknown], fit: Fit) -> 
         if float(np.linalg.norm(shown)) > _CLEAR and fit.theta[k] > _NOTABLE:
             value, target = spring.low + fit.theta[k] * (spring.high - spring.low), spring.targets[0]
             out.append(
-                f"a spring of about {value:.2g} in SI seems to act where the model has none: make {target!r} a "
-                f"parameter, [{spring.low:g}, {spring.high:.2g}], and its springref"
+                f"a spring of about {value:.2g} in SI seems to act where the model has none: add {target!r} as "
+                f"a parameter, [{spring.low:g}, {spring.high:.2g}], and its springref"
             )
     return out

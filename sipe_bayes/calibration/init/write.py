@@ -69,7 +69,7 @@ def summary(draft: Draft, path: str) -> list[str]:
     held, train = (
         sum(max(1, len(log.episodes)) for log in draft.logs if log.use == use) for use in ("holdout", "train")
     )
-    lines.append(f"time {draft.clock.column!r} in {draft.clock.unit}; {train} logs train, {held} held out")
+    lines.append(f"time {draft.clock.column!r} in {draft.clock.unit}; {train} to train on, {held} held out")
     names = [unknown.name for unknown in draft.proposed]
     lines.append(_short(f"{len(names)} unknowns: {', '.join(names)}"))
     lines += [_short(u.note) for u in draft.proposed if u.name == "delay"]

@@ -99,4 +99,4 @@ def test_a_spring_is_told_where_one_shows(size: float, theta: float, shown: bool
     mass, spring = Unknown("mass", (), 0.0, 1.0, False, ""), Unknown("s", ("joint:j.stiffness",), 0.0, 4.0, False, "")
     lines = sprung([mass], [spring], fit)
     assert bool(lines) is shown
-    assert all("of about 2 in SI" in line and "'joint:j.stiffness' a parameter, [0, 4]" in line for line in lines)
+    assert all("of about 2 in SI" in line and "'joint:j.stiffness' as a parameter, [0, 4]" in line for line in lines)
