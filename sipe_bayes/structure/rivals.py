@@ -28,3 +28,8 @@ def rivals(
     own = max((offer.gain for label, offer in there.items() if label in whole), default=0.0)
     close = [o for label, o in there.items() if label not in whole and o.gain > 0 and o.gain >= (1 - share) * own]
     return sorted(close, key=lambda offer: -offer.gain)[:most]
+
+
+def behind(one: float | None, other: float | None) -> float:
+    """By how many nats a score is behind another; by none where either is missing."""
+    return 0.0 if one is None or other is None else other - one

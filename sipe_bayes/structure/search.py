@@ -46,7 +46,7 @@ from sipe_bayes.structure.columns import Column, choices, log_jacobian, moving, 
 from sipe_bayes.structure.extension import Extension, Placed, members, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
 from sipe_bayes.structure.machine import Machine, machine_of
-from sipe_bayes.structure.rivals import rivals
+from sipe_bayes.structure.rivals import behind, rivals
 from sipe_bayes.structure.state import DiscoverState, Judgement, Offer, Phase
 
 BUDGET = 30_000  # rollouts by default: structures with two pieces of a machine with two joints
@@ -313,9 +313,8 @@ class StructureSearch:
 
     def _speaks_against(self, state: DiscoverState, one: FittedStructure) -> bool:
         """Whether held-out logs are foretold worse by a structure than by the present one."""
-        judgements = state.judgement(state.present), state.judgement(one.labels)
-        here, other = (None if judgement is None else judgement.log_score for judgement in judgements)
-        return here is not None and other is not None and other < here - self.options.against
+        here, other = state.judgement(state.present), state.judgement(one.labels)
+        return bool(here and other and behind(other.log_score, here.log_score) > self.options.against)
 
     def _again(self, state: DiscoverState) -> DiscoverState:
         """The present structure from where the larger one ended, whose gain may be nothing but a better optimum."""
@@ -367,8 +366,9 @@ class StructureSearch:
         own, close = set(here.labels), [one for one in state.fitted if len(one.labels) == len(here.labels)]
         close = [one for one in close if len(own ^ set(one.labels)) == 2 and not state.is_refused(one.labels)]
         best = max((one for one in close if self.better(one, here)), key=self.total, default=None)
-        if best is None:
-            return replace(state, phase=Phase.RESIDUAL)
+        if best is None:  # what pieces speak against does not count, whatever its evidence
+            lost = [one.labels for one in close if behind(one.held_out, here.held_out) > options.against]
+            return replace(state, phase=Phase.RESIDUAL, refused=(*state.refused, *lost))
         if self._speaks_against(state := self._judged(state, best), best):
             return replace(state, refused=(*state.refused, best.labels))
         return replace(state, present=best.labels, phase=Phase.PRUNE)

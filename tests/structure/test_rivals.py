@@ -96,3 +96,14 @@ def test_a_rival_takes_the_place_unless_held_out_logs_speak_against_it(
     assert state.present == ends_with
     assert state.is_refused(("b", "d")) == (log_score is not None and log_score < 0)
     assert state.phase is Phase.RESIDUAL
+
+
+@pytest.mark.parametrize(("held", "refused"), [(15.0, True), (19.0, False), (None, False)])
+def test_a_rival_that_held_out_pieces_speak_against_does_not_count(held: float | None, refused: bool) -> None:
+    """Whatever its evidence; what is behind by less than two nats, or not scored, does."""
+    fitted = [replace(structure(x, e), held_out=20.0) for x, e in (("", 0), ("a", 100), ("d", 90), ("ad", 200))]
+    rival = replace(structure("ab", 220), held_out=held)
+    fitting: Any = SimpleNamespace(holdout=None, corrected=lambda columns: fitting)
+    state = DiscoverState(Phase.SWAP, (*fitted, rival), ("a", "d"), ranked=(("a",), ("d",)))
+    after = StructureSearch(fitting, ())._swap(state)
+    assert after.is_refused(("a", "b")) is refused
