@@ -85,7 +85,7 @@ def test_a_piece_is_averaged_over_the_structures_that_have_it(two_effects: Struc
     pressed[index[0]] = 0.0  # half of it is cut off
     alike = [replace(one, mean=pressed) if one is having[0] else one for one in alike]
     posterior = Structures(
-        structures.search, replace(structures.state, fitted=tuple(alike), columns=())
+        structures.search, replace(structures.state, fitted=tuple(alike), columns=(), refused=())
     ).posterior_of_piece(label)
     means = [0.0, *(one.mean[k] for one, k in zip(having[1:], index[1:], strict=True))]
     assert posterior.means.numpy()[:, 0] == pytest.approx(means)
