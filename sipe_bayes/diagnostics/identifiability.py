@@ -123,14 +123,14 @@ def worth_measuring(
     left = 1 - np.asarray(contraction)
     would = left * np.sqrt(np.maximum(1 - square, 0.0)) < 1 - THRESHOLDS.well_determined
     opened = left >= 1 - THRESHOLDS.well_determined
-    told = would & opened & ~np.eye(len(left), dtype=bool)  # row: what is measured
-    told[[p.log is not None for p in space] | ~opened] = False
+    tells = would & opened & ~np.eye(len(left), dtype=bool)  # row: what is measured
+    tells[[p.log is not None for p in space] | ~opened] = False
     mass = np.array([bool(p.targets) and all(target.endswith(".mass") for target in p.targets) for p in space])
-    many = told.sum(1) >= _SEVERAL
-    best = int(np.argmax(np.where(many, told.sum(1) + 1.5 * mass, 0.0)))
+    many = tells.sum(1) >= _SEVERAL
+    best = int(np.argmax(np.where(many, tells.sum(1) + 1.5 * mass, 0.0)))
     if not many[best]:
         return None
-    return space[best].name, tuple(space[k].name for k in np.flatnonzero(told[best]).tolist())
+    return space[best].name, tuple(space[k].name for k in np.flatnonzero(tells[best]).tolist())
 
 
 def _members(loadings: FloatArray) -> IntArray:

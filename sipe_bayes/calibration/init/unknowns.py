@@ -365,7 +365,8 @@ def roomy(model: mujoco.MjModel, unknown: Unknown, theta: float) -> Unknown:
     if (low, high) == (unknown.low, unknown.high):
         return unknown
     note = f"{unknown.note}; bounds wider, since simulated windows press against the usual one"
-    return replace(unknown, low=float(f"{low:.2g}"), high=float(f"{high:.2g}"), note=note)
+    low = rounded_up(low) if low > 0 else float(f"{low:.2g}")  # never below the least
+    return replace(unknown, low=low, high=float(f"{high:.2g}"), note=note)
 
 
 def _least(model: mujoco.MjModel, unknown: Unknown) -> float:
