@@ -23,7 +23,6 @@ from sipe_bayes.diagnostics.evaluate import (
     errors_from_best_starts,
     fitted_residuals,
     fitted_units,
-    measured_starts,
     signals,
 )
 from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
@@ -32,6 +31,7 @@ from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.records import Comparison, Signal
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.unknowns import bounded_by_nature
+from sipe_bayes.inference.laplace.windows.measured_starts import measured_starts
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.windows import Windows
@@ -136,7 +136,7 @@ def _thinned(problem: Problem, structures: Structures) -> tuple[Finding, ...]:
     """That the search has left out parts of long logs, where it has."""
     fitting = structures.search.fitting
     windows = fitting.windows(fitting.simulator([]))
-    used, logs = float((windows.steps * windows.dt).sum()), problem.train
+    used, logs = float((windows.stride * windows.dt).sum()), problem.train
     all_of = float((logs.length * logs.dt).sum())
     return (finding(Code.SEARCHED_ON_PARTS, used=used, all=all_of),) if used < 0.99 * all_of else ()
 

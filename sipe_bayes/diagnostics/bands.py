@@ -133,7 +133,7 @@ def _pieces(windows: Windows, channel: int) -> list[BoolArray]:
     """Masks (W, L) of a channel's samples: tenths of each log."""
     masks = []
     for k in range(len(windows.trajectories)):
-        own = windows.owned & windows.observed[..., channel] & (windows.log == k)[:, None]
+        own = windows.observed[..., channel] & (windows.log == k)[:, None]
         places = np.flatnonzero(own)
         for part in np.array_split(places, PIECES):
             if len(part):

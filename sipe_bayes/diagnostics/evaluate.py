@@ -10,7 +10,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 
-import mujoco
 import numpy as np
 import scipy.stats
 import torch
@@ -19,10 +18,10 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Residual, Signal
 from sipe_bayes.inference.laplace.options import GrowingTuning
-from sipe_bayes.inference.laplace.windows.growing_windows import grown_starts, grows, tells_starts, told_starts
+from sipe_bayes.inference.laplace.windows.growing_windows import grown_starts, grows
+from sipe_bayes.inference.laplace.windows.measured_starts import measured_starts
 from sipe_bayes.likelihood.noise import Noise, whiten
 from sipe_bayes.likelihood.restricted import marginal
-from sipe_bayes.likelihood.starts import velocity_columns
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 
@@ -33,38 +32,6 @@ _SETTLED = 1e-3  # of the sum of squares: a step of the starts that gained less 
 _ITERATIONS = 4  # in which starts are looked for
 _AT_LIMIT = 1e-3  # relative: so near to it a correlation time is the longest that may be
 _PIECES = 10  # of a log: errors of neighbouring samples are not independent, of tenths nearly so
-
-
-def measured_starts(windows: Windows, theta: FloatArray, near: FloatArray | None = None) -> FloatArray:
-    """Starts (B, W, D) of theta (B, N): what was measured there, as theta claims the sensors' bias and scale.
-
-    Of bodies that tumble those of ``near`` (N,) serve all, default each theta its own.
-    """
-    if tells_starts(windows) and windows.trajectories.states is None:
-        own = [told_starts(windows, at, GrowingTuning()) for at in (theta if near is None else near[None])]
-        return np.broadcast_to(np.stack(own), (len(theta), *own[0].shape))
-    simulator, model = windows.simulator, windows.simulator.model
-    starts = np.tile(windows.no_starts(), (len(theta), 1, 1))
-    states, tangent = simulator.environment.state_columns(model), _tangents(model)
-    columns = {channel: tangent[column] for channel, column in enumerate(states) if column in tangent}
-    for b, values in enumerate(simulator.space.values(theta)):
-        for name in set(windows.names):
-            sensing = simulator.environment.sensing(values, name)
-            mine = [w for w, log in enumerate(windows.names) if log == name]
-            for channel, column in columns.items():
-                bias, scale, place = sensing.bias[channel], sensing.scale[channel], states[channel]
-                if scale != 1.0 and scale:
-                    measured = windows.reference[mine, place]
-                    starts[b, mine, column] = (measured - bias) / scale - measured
-                elif bias:
-                    starts[b, mine, column] = -bias
-    return starts
-
-
-def _tangents(model: mujoco.MjModel) -> dict[int, int]:
-    """Column of the physics state -> column of a start, but of a quaternion's numbers."""
-    columns = {1 + model.nq + dof: model.nv + dof for dof in range(model.nv)}
-    return columns | {position: velocity - 1 - model.nq for position, velocity in velocity_columns(model).items()}
 
 
 def errors(windows: Windows, theta: FloatArray) -> FloatArray:
@@ -150,7 +117,7 @@ def compare_errors(
     parts = []  # of each log: sums (2, pieces, C)
     for k in range(len(windows.trajectories)):
         mine = windows.log == k
-        rows, owned = square[:, mine].reshape(2, -1, square.shape[-1]), windows.owned[mine].ravel()
+        rows, owned = square[:, mine].reshape(2, -1, square.shape[-1]), windows.compared[mine].any(-1).ravel()
         pieces = np.array_split(rows[:, owned], _PIECES, axis=1)
         sums = np.stack([piece.sum(1) for piece in pieces], axis=1)
         usable = np.isfinite(sums).all((0, 1)) & (np.count_nonzero(sums, axis=1) > 1).all(0)
@@ -235,7 +202,8 @@ def _stitched(windows: Windows, predicted: FloatArray, log: int) -> FloatArray:
     """Predictions (B, T+1, C) of one log, of predicted (B, W, L, C); NaN where no window stands."""
     out = np.full((len(predicted), len(windows.trajectories[log].time), predicted.shape[-1]), np.nan)
     for w in np.flatnonzero(windows.log == log):
-        out[:, windows.start[w] + np.flatnonzero(windows.owned[w])] = predicted[:, w][:, windows.owned[w]]
+        place, channel = np.nonzero(windows.compared[w])
+        out[:, windows.start[w] + place, channel] = predicted[:, w, place, channel]
     return out
 
 

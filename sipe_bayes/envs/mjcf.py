@@ -276,14 +276,11 @@ class MjcfEnvironment(Environment):
 
     @cached_property
     def remembers(self) -> FloatArray:
-        """Of sensors with an unknown delay or filter; a joint goes on steadily enough before, what follows from it not.
-
-        Three time constants of a filter.
-        """
+        """Of sensors with an unknown delay or filter: the longest delay, three time constants of the slowest filter."""
         out = np.zeros(len(self.channels))
         for j, attribute, channels in self._sensed:
             spans = {"delay": self.parameters[j].high, "filter": 3 * self.parameters[j].high}
-            out[[k for k in channels if self._readers[k].derived]] += spans.get(attribute, 0.0)
+            out[channels] += spans.get(attribute, 0.0)
         return out
 
     @cached_property

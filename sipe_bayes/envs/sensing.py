@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.rotations import added, between
 
 if TYPE_CHECKING:
     from sipe_bayes.envs.channels import Channel
@@ -58,18 +59,21 @@ class Sensing:
         rows = zip(*((s.bias, s.scale, s.delay, s.filter) for s in every), strict=True)
         return cls(*(np.stack(row) for row in rows))
 
-    def seen(self, observations: FloatArray, dt: FloatArray) -> FloatArray:
+    def seen(
+        self, observations: FloatArray, dt: FloatArray, rotations: Sequence[tuple[int, int, int]] = ()
+    ) -> FloatArray:
         """What is measured.
 
         Args:
             observations: (B, T+1, O), of the sensors' inputs.
             dt: (B,) seconds between them.
+            rotations: channels that are together a rotation vector.
 
         Returns:
             Observations (B, T+1, O).
         """
         if self.delay.any():
-            late = _delayed(observations, self.delay[:, None] / dt[:, None, None])
+            late = delayed(observations, self.delay[:, None] / dt[:, None, None], rotations)
             observations = np.where(self.delay[:, None] > 0, late, observations)
         if self.filter.any():
             observations = _filtered(observations, self.filter, dt[:, None])
@@ -78,12 +82,19 @@ class Sensing:
         return observations + self.bias[:, None]
 
 
-def _delayed(y: FloatArray, samples: FloatArray) -> FloatArray:
-    """``y`` (B, T+1, O) as it was ``samples`` (B, 1, O) earlier, linear between samples and before the first."""
+def delayed(y: FloatArray, samples: FloatArray, rotations: Sequence[tuple[int, int, int]] = ()) -> FloatArray:
+    """``y`` (B, T+1, O) as it was ``samples`` (B, 1, O) earlier, linear between, before and after its samples.
+
+    Rotation vectors, of which ``rotations`` has the channels, turn about axes that stay.
+    """
     place = np.arange(y.shape[1])[:, None] - samples
     before = np.clip(np.floor(place), 0, y.shape[1] - 2).astype(int)
     here, there = np.take_along_axis(y, before, 1), np.take_along_axis(y, before + 1, 1)
-    return np.asarray(here + (place - before) * (there - here))
+    share, out = place - before, np.empty_like(y)
+    out[...] = here + share * (there - here)
+    for triple in map(list, rotations):
+        out[..., triple] = added(here[..., triple], share[..., triple] * between(there[..., triple], here[..., triple]))
+    return out
 
 
 def _filtered(y: FloatArray, tau: FloatArray, dt: FloatArray) -> FloatArray:
@@ -101,15 +112,17 @@ def _filtered(y: FloatArray, tau: FloatArray, dt: FloatArray) -> FloatArray:
 def sensed_channels(target: str, channels: Sequence[Channel]) -> tuple[str, list[int]] | None:
     """What of a sensor a target ``sensor:NAME.bias`` writes, and the channels; None for another kind of target.
 
-    They are those called NAME, or those that read the sensor NAME. Beside ``bias`` there are ``scale``, ``delay`` and
-    ``filter``.
+    They are those called NAME, or those that read the sensor NAME, or the three of a vector NAME. Beside ``bias`` there
+    are ``scale``, ``delay`` and ``filter``.
     """
     match = _SENSED.match(target)
     if not match:
         return None
     name, attribute = match.groups()
     sensor = re.compile(rf"^sensor:{re.escape(name)}(\[\d+\])?$")
-    return attribute, [k for k, c in enumerate(channels) if c.label == name or sensor.match(c.target)]
+    own = [k for k, c in enumerate(channels) if c.label == name or sensor.match(c.target)]
+    vector = {f"{name}_{axis}" for axis in "xyz"}
+    return attribute, own or [k for k, c in enumerate(channels) if c.label in vector]
 
 
 def of_sensor(target: str) -> str | None:

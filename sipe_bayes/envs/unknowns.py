@@ -48,7 +48,7 @@ def with_model_values(model: mujoco.MjModel, parameter: Parameter, channels: Seq
         sensed = sensed_channels(spec, channels)
         if sensed is not None:
             attribute, concerned = sensed
-            unit = _channel_unit(parameter, spec, channels, concerned)
+            unit = _channel_unit(parameter, spec, channels, concerned, attribute)
             units.append(UNITS.get(attribute, unit))
             values.append(NEUTRAL[attribute])
             least = max(least, LEAST.get(attribute, -np.inf))
@@ -73,11 +73,13 @@ def with_model_values(model: mujoco.MjModel, parameter: Parameter, channels: Seq
     return replace(parameter, unit=parameter.unit or units[0], default=default)
 
 
-def _channel_unit(parameter: Parameter, target: str, channels: Sequence[Channel], concerned: Sequence[int]) -> str:
-    if any(is_rotation(channels[k]) for k in concerned):
+def _channel_unit(
+    parameter: Parameter, target: str, channels: Sequence[Channel], concerned: Sequence[int], attribute: str
+) -> str:
+    if any(is_rotation(channels[k]) for k in concerned) and (attribute != "delay" or len(concerned) % 3):
         raise TargetError(
-            f"parameter {parameter.name!r}: target {target!r} is of an orientation, whose sensor has no bias, scale, "
-            "delay or filter here; turn the frame in the MJCF instead"
+            f"parameter {parameter.name!r}: target {target!r} is of an orientation, whose sensor has a delay, of the "
+            "whole measurement, and no bias, scale or filter here; turn the frame in the MJCF instead"
         )
     if concerned:
         return channels[concerned[0]].unit

@@ -29,11 +29,13 @@ class CallableWindows(Windows):
         self.channels, self.rotations = fitted_channels(simulator.environment.channels, settings.fit), ()
         self.scales = np.arange(len(self.channels))
         count = len(trajectories)
-        self.log, self.start, self.steps = np.arange(count), np.zeros(count, int), np.ones(count, int)
+        self.log, self.start, self.stride = np.arange(count), np.zeros(count, int), np.ones(count, int)
+        self.steps = self.stride
         self.dt, self.names, self.goals = trajectories.dt, list(trajectories.names), None
         self.owned = np.tile([False, True], (count, 1))
         self.measured = trajectories.observations[:, :, self.channels]
-        self.observed = self.owned[:, :, None] & np.isfinite(self.measured)
+        self.compared = np.repeat(self.owned[:, :, None], len(self.channels), -1)
+        self.observed = self.compared & np.isfinite(self.measured)
         unseen = [n for n, seen in zip(self.fitted, self.observed.any(axis=(0, 1)), strict=True) if not seen]
         if unseen:
             raise ValueError(

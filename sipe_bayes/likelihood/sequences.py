@@ -88,14 +88,47 @@ def _rates(dt: FloatArray) -> FloatArray:
     return -alike
 
 
-def settled(remembers: FloatArray, dt: FloatArray, steps: IntArray, places: IntArray) -> BoolArray:
-    """Which samples (W, L, C) of windows tell of the window alone; of a short one at least the second half.
+def leads(remembers: FloatArray, dt: FloatArray, length: IntArray) -> IntArray:
+    """Samples (W, C) after a window's beginning in which a channel tells of what was before; half a log's at most.
 
     Args:
-        remembers: (C,) seconds in which a channel tells of what was before.
+        remembers: (C,) seconds in which it does.
         dt: (W,) seconds between samples.
-        steps: (W,) of each window.
-        places: (L,) of the samples in it.
+        length: (W,), control steps of the logs.
     """
-    first = np.minimum(np.ceil(remembers / dt[:, None] - 1e-9), steps[:, None] // 2)
-    return np.asarray(places[:, None] >= first[:, None])
+    return np.asarray(np.minimum(np.ceil(remembers / dt[:, None] - 1e-9), length[:, None] // 2), np.int64)
+
+
+def owned_samples(place: IntArray, stride: IntArray, left: IntArray, known: bool) -> BoolArray:
+    """Whether a sample (W, L) is the window's: of each log every sample is of one.
+
+    Args:
+        place: (L,), in the window.
+        stride: (W,), control steps to the beginning of the next window.
+        left: (W,), to the end of the log.
+        known: whether starts are, so that the samples after them are what a window predicts.
+    """
+    if known:
+        return np.asarray((place >= 1) & (place <= stride[:, None]))
+    return np.asarray(place < (stride + (stride == left))[:, None])
+
+
+def compared_samples(
+    place: IntArray, stride: IntArray, left: IntArray, begin: IntArray, lead: IntArray, known: bool
+) -> BoolArray:
+    """Whether a window predicts a channel's sample (W, L, C): those ``lead`` later than ``owned_samples``.
+
+    Args:
+        place: (L,), in the window.
+        stride: (W,), control steps to the beginning of the next window.
+        left: (W,), to the end of the log.
+        begin: (W, C), the first that it predicts.
+        lead: (W, C), see ``leads``.
+        known: whether starts are.
+    """
+    end, begin = (stride[:, None] + lead)[:, None], begin[:, None]
+    place, inside = place[None, :, None], (place <= left[:, None])[..., None]
+    if known:
+        return np.asarray((place > begin) & (place <= end) & inside)
+    at_end = (stride == left)[:, None, None] & (lead == 0)[:, None]
+    return np.asarray((place >= begin) & (place < end + at_end) & inside)

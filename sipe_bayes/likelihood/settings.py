@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from sipe_bayes.core.arrays import BoolArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
@@ -59,6 +59,8 @@ class Segments:
         starts: "estimated" with theta, or "recorded": the trajectories' states are exact (they come from a simulator)
             and each window predicts the samples after its start; ``window`` = dt then compares single control steps.
         seconds: of all logs together that count at most: blocks of windows spread over them, None for all.
+        late: (channel, seconds) of each log's first samples that do not count, as if its sensor came so late: for
+            models that are compared, some with a late sensor and some without.
 
     Raises:
         ValueError: for any other setting.
@@ -71,6 +73,7 @@ class Segments:
     windows: tuple[tuple[str, float | None], ...] = ()
     starts: str = "estimated"
     seconds: float | None = None
+    late: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
         if self.noise not in ("ar1", "white", "sandwich"):
@@ -79,6 +82,8 @@ class Segments:
             raise ValueError(f"window: expected seconds above zero, or None for whole logs, got {self.window}")
         if self.seconds is not None and not self.seconds > 0:
             raise ValueError(f"seconds: expected a time above zero, or None for all of the logs, got {self.seconds}")
+        if any(not (isinstance(x, Real) and 0 <= float(x) < math.inf) for _, x in self.late):
+            raise ValueError(f"late: expected names of channels with seconds not below zero, got {self.late!r}")
         check_settings(self.starts, self.fit, self.noise_sd)
 
 
@@ -152,3 +157,14 @@ def check_seen(names: Sequence[str], seen: BoolArray) -> None:
     """Raise ValueError for a fitted channel without any sample; seen (C,)."""
     for name in np.array(names)[~seen]:
         raise ValueError(f"trajectories: the fitted channel {str(name)!r} has no sample at all; leave it out of `fit`")
+
+
+def check_prompt(names: Sequence[str], remembers: FloatArray, dt: float) -> None:
+    """Raise ValueError where channels (C,) tell of what was more than a control step ago."""
+    slow = [(name, seconds) for name, seconds in zip(names, remembers.tolist(), strict=True) if seconds > dt]
+    if slow:
+        name, seconds = slow[0]
+        raise ValueError(
+            f"likelihood: StateSpace can not follow {name!r}, whose delay or filter may reach back {seconds:.3g} s, "
+            f"more than a control step of {dt:.3g} s; use windows, Segments(), or narrower bounds"
+        )

@@ -1,11 +1,12 @@
 """log p(trajectory | theta) by windows of the log (multiple shooting), each window's start estimated with theta.
 
 A log of T samples is cut into windows of ``window`` seconds; each is simulated from its own starting state, which is
-unknown and is estimated (``laplace``) or marginalised (``mcmc``) with theta. Every sample is predicted by one window at
-most (not what a late sensor tells of the time before it). Long open loops are chaotic and one model error would
-dominate them; short windows with measured starts give away the noise of the measurement: both cost coverage. Residuals
-are white or first-order autoregressive, across windows too (``sipe_bayes.likelihood.noise``). That of an orientation is
-the rotation vector from the predicted to the measured one, three numbers of one noise scale.
+unknown and is estimated (``laplace``) or marginalised (``mcmc``) with theta. Every sample is predicted by one window:
+what a late or filtered sensor (``Environment.remembers``) tells of the time before a window by the one before, which is
+simulated on for it, and what it tells of the time before a log by none. Long open loops are chaotic and one model error
+would dominate them; short windows with measured starts give away the noise of the measurement: both cost coverage.
+Residuals are white or first-order autoregressive, across windows too (``sipe_bayes.likelihood.noise``). That of an
+orientation is the rotation vector from the predicted to the measured one, three numbers of one noise scale.
 
 A start is the tangent of the state at a reference: (dq (nv), dv (nv), dact (na)), with a weak normal prior, far wider
 than any measurement (``Environment.start_sd``), so that what is never measured does not make the equations singular.
@@ -25,7 +26,7 @@ from sipe_bayes.core.rotations import nearest, written_near
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_scales, whiten
-from sipe_bayes.likelihood.sequences import Sequence, sequences, settled, spread_blocks
+from sipe_bayes.likelihood.sequences import Sequence, compared_samples, leads, owned_samples, sequences, spread_blocks
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments, chosen_channels, fitted_rotations
 from sipe_bayes.likelihood.starts import (
     STATE_STEP,
@@ -40,6 +41,8 @@ from sipe_bayes.likelihood.starts import (
 from sipe_bayes.simulation.contacts import Contacts
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import moved
+
+_LEFT_OUT = 8  # one in so many of a log's samples at most, as telling of the time before it
 
 
 @dataclass(frozen=True)
@@ -100,30 +103,32 @@ class Windows:
                 )
             steps = self.simulator.engine.firmware.whole(steps, trajectory.dt)
             pieces += [(k, s, min(steps, len(trajectory) - s)) for s in range(0, len(trajectory), steps)]
-        self.log, self.start, self.steps = (np.array(x) for x in zip(*pieces, strict=True))
+        self.log, self.start, self.stride = (np.array(x) for x in zip(*pieces, strict=True))
         if like is not None:
-            self.log, self.start, self.steps = like.log, like.start, like.steps
+            self.log, self.start, self.stride = like.log, like.start, like.stride
         elif self.settings.seconds is not None:
-            lasting = float((self.steps * trajectories.dt[self.log]).sum())
+            lasting = float((self.stride * trajectories.dt[self.log]).sum())
             keep = spread_blocks(self.log, self.settings.seconds / lasting)
-            self.log, self.start, self.steps = self.log[keep], self.start[keep], self.steps[keep]
+            self.log, self.start, self.stride = self.log[keep], self.start[keep], self.stride[keep]
         self.dt = trajectories.dt[self.log]
         self.names = [(trajectories.names or [None] * len(trajectories))[k] for k in self.log]
 
     def _read_samples(self, trajectories: Trajectories) -> None:
         simulator, environment = self.simulator, self.simulator.environment
-        longest = int(self.steps.max())
-        sample = self.start[:, None] + np.arange(longest + 1)
-        last = self.start + self.steps == trajectories.length[self.log]
-        place = np.arange(longest + 1)
-        if self.settings.starts == "recorded":
-            self.owned = (place >= 1) & (place <= self.steps[:, None])
-        else:
-            self.owned = place < (self.steps + last)[:, None]
+        left, recorded_starts = trajectories.length[self.log] - self.start, self.settings.starts == "recorded"
+        remembers, length = environment.remembers[self.channels], trajectories.length[self.log]
+        late = np.array([dict(self.settings.late).get(name, 0.0) for name in self.fitted])
+        lead, out = (leads(x, self.dt, length) for x in (remembers, np.maximum(remembers, late)))
+        self.steps = np.minimum(self.stride + lead.max(1), left)
+        place = np.arange(int(self.steps.max()) + 1)
+        sample = self.start[:, None] + place
+        self.owned = owned_samples(place, self.stride, left, recorded_starts)
+        left_out = np.minimum(out, length[:, None] // _LEFT_OUT) - self.start[:, None]
+        begin = np.maximum(left_out, np.where(self.start[:, None], lead, 0))
+        self.compared = compared_samples(place, self.stride, left, begin, lead, recorded_starts)
         clipped = np.minimum(sample, trajectories.length[self.log][:, None])
         self.measured = trajectories.observations[self.log[:, None], clipped][:, :, self.channels]
-        tells = settled(environment.remembers[self.channels], self.dt, self.steps, place)
-        self.observed = self.owned[:, :, None] & np.isfinite(self.measured) & tells
+        self.observed = self.compared & np.isfinite(self.measured)
         self.actions = trajectories.actions[
             self.log[:, None], np.minimum(sample, trajectories.length[self.log][:, None] - 1)
         ][:, :-1]
@@ -188,7 +193,7 @@ class Windows:
         for name in ("spread", "rounding"):
             vars(view).pop(name, None)
         view.steps, view.actions = np.minimum(self.steps, steps), self.actions[:, :steps]
-        for name in ("owned", "measured", "observed"):
+        for name in ("owned", "compared", "measured", "observed"):
             setattr(view, name, getattr(self, name)[:, : steps + 1])
         sample = view.start[:, None] + np.arange(steps + 1)
         view.sequences = sequences(view.observed, sample, view.log, view.dt)
@@ -199,7 +204,8 @@ class Windows:
         view = copy.copy(self)
         for name in ("spread", "rounding"):
             vars(view).pop(name, None)
-        for name in ("log", "start", "steps", "dt", "owned", "measured", "observed", "actions", "reference"):
+        by_window = ("log", "start", "stride", "steps", "dt", "owned", "compared", "measured", "observed")
+        for name in (*by_window, "actions", "reference"):
             setattr(view, name, getattr(self, name)[keep])
         view.goals = None if self.goals is None else self.goals[keep]
         view.names = [self.names[w] for w in keep]
@@ -285,7 +291,8 @@ class Windows:
         predicted = result.observations.reshape(*shape, *result.observations.shape[1:])[..., self.channels]
         predicted = np.where(good[..., None], predicted, np.nan)
         predicted = written_near(predicted, self.measured, self.rotations)
-        return predicted, np.asarray((good | ~self.owned).all(axis=(1, 2)))
+        needed = self.owned | self.compared.any(-1)
+        return predicted, np.asarray((good | ~needed).all(axis=(1, 2)))
 
     def spend(self, batch: int) -> None:
         """Count the rollouts of ``batch`` thetas; raises BudgetExhausted where there are too few left."""

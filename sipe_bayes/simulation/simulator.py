@@ -288,7 +288,7 @@ class Simulator(Simulated):
         states, derived, valid = self.runs.advance(given)
         targets = None if goals is None else goals[run, None]
         observations = self.environment.observe(self.model, states, derived, targets)
-        seen = pool.sensing(slots).seen(observations, skip * timesteps)
+        seen = pool.sensing(slots).seen(observations, skip * timesteps, self.environment.rotations)
         motion.states[at], motion.observations[at], motion.valid[at] = states, seen, valid
         if derived is not None and motion.derived is not None:
             motion.derived[at] = derived

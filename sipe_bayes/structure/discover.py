@@ -169,16 +169,18 @@ def _search(
     restriction, options = restriction or Restriction(), options or DiscoverOptions()
     _check_sites(environment, restriction.sites)
     seconds = options.physics_steps * float(simulator.model.opt.timestep)
+    extensions = [get_extension(name) for name in restriction.names]
+    memory = max((extension.memory(float(trajectories.dt.max())) for extension in extensions), default=0.0)
+    late = [c for c in environment.channels if memory and (restriction.sites is None or c in restriction.sites)]
     fitting = Fitting(
         environment,
         trajectories,
         holdout,
-        replace(likelihood or Segments(), noise="ar1", seconds=seconds),
+        replace(likelihood or Segments(), noise="ar1", seconds=seconds, late=tuple((c, memory) for c in late)),
         default_prior(environment.space) if prior is None else prior,
         whole("seed", seed, 0),
         simulator.num_threads or cores(),
     )
-    extensions = [get_extension(name) for name in restriction.names]
     most = whole("budget", budget, 1, "rollouts", MOST_ROLLOUTS)
     return StructureSearch(fitting, extensions, restriction.sites, options, most, progress)
 

@@ -73,6 +73,10 @@ class Extension(ABC):
         """What it is where a number with a tolerance is off by this share, in a report."""
         return f"{self.sentence(site)} ({100 * share:.3g} %)"
 
+    def memory(self, dt: float) -> float:
+        """Seconds that a sample at most tells of the past, of logs with ``dt``: see ``Environment.remembers``."""
+        return 0.0
+
     def edit(self, machine: Machine, site: str) -> Edit | None:
         """What is changed in the MJCF, where parameters of it are not enough."""
         return None

@@ -41,7 +41,7 @@ def carried_starts(before: mujoco.MjModel, windows: Windows, theta: FloatArray, 
     dt, names = np.tile(windows.dt, len(theta)), windows.names * len(theta)
     run = windows.simulator.rollout(thetas, actions, states, dt, names)
     assert run.states is not None
-    last = run.states.reshape(len(theta), count, *run.states.shape[1:])[:, np.arange(count), windows.steps]
+    last = run.states.reshape(len(theta), count, *run.states.shape[1:])[:, np.arange(count), windows.stride]
     columns = np.array([_column(after, int(number)) for number in own])
     shift = last[:, :-1][..., columns] - windows.reference[1:][:, columns]
     out = starts.copy()
@@ -51,7 +51,7 @@ def carried_starts(before: mujoco.MjModel, windows: Windows, theta: FloatArray, 
 
 def _follows(windows: Windows) -> BoolArray:
     """Which windows but the first (W - 1,) go on where the one before them ends."""
-    return (windows.log[1:] == windows.log[:-1]) & (windows.start[1:] == windows.start[:-1] + windows.steps[:-1])
+    return (windows.log[1:] == windows.log[:-1]) & (windows.start[1:] == windows.start[:-1] + windows.stride[:-1])
 
 
 def _column(model: mujoco.MjModel, number: int) -> int:

@@ -18,6 +18,8 @@ each state, as positions and velocities tell it.
 
 Deviations from the textbooks:
 
+- A sensor with an unknown delay or filter that may be longer than a control step is refused: a state knows nothing
+  of the steps before it.
 - Measurement channels that the environment reads one physics step late (``derived_late``) are predicted by the step
   that led to the sample, so that process noise does not reach them.
 """
@@ -34,7 +36,14 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.rotations import written_near
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.noise import chosen_sd, noise_scales
-from sipe_bayes.likelihood.settings import BudgetExhausted, StateSpace, check_seen, chosen_channels, fitted_rotations
+from sipe_bayes.likelihood.settings import (
+    BudgetExhausted,
+    StateSpace,
+    check_prompt,
+    check_seen,
+    chosen_channels,
+    fitted_rotations,
+)
 from sipe_bayes.likelihood.starts import estimate_states, past_commands, start_sd, with_history
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import moved, tangents
@@ -63,6 +72,7 @@ class Chain:
         self.settings, self.simulator, self.trajectories = settings, simulator, trajectories
         self.rollouts, self.uncounted, self.budget, self.short = 0, 0.0, math.inf, False
         self.channels = chosen_channels(simulator, trajectories, settings.fit)
+        check_prompt(self.fitted, simulator.environment.remembers[self.channels], float(trajectories.dt.max()))
         self.rotations = fitted_rotations(simulator.environment.rotations, self.channels)
         self.scales = noise_scales(len(self.channels), self.rotations)
         steps = trajectories.length

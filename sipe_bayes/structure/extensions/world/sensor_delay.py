@@ -27,11 +27,15 @@ class SensorDelay(Extension):
             Parameter(
                 f"{site}.delay",
                 0.0,
-                min(0.1, 20 * machine.dt),
+                self.memory(machine.dt),
                 targets=tuple(f"sensor:{name}.delay" for name in members(site)),
                 description="age of the measurement",
             ),
         )
+
+    def memory(self, dt: float) -> float:
+        """The longest delay."""
+        return min(0.1, 20 * dt)
 
     def imitators(self, site: str) -> tuple[str, ...]:
         """A low-pass filter."""

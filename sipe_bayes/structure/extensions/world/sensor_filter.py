@@ -27,11 +27,19 @@ class SensorFilter(Extension):
             Parameter(
                 f"{site}.filter",
                 0.0,
-                min(0.1, 20 * machine.dt),
+                self._slowest(machine.dt),
                 targets=tuple(f"sensor:{name}.filter" for name in members(site)),
                 description="time constant of a low-pass filter",
             ),
         )
+
+    def memory(self, dt: float) -> float:
+        """Three of the longest time constants."""
+        return 3 * self._slowest(dt)
+
+    @staticmethod
+    def _slowest(dt: float) -> float:
+        return min(0.1, 20 * dt)
 
     def imitators(self, site: str) -> tuple[str, ...]:
         """A delay."""
