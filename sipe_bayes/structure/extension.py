@@ -77,6 +77,10 @@ class Extension(ABC):
         """Seconds that a sample at most tells of the past, of logs with ``dt``: see ``Environment.remembers``."""
         return 0.0
 
+    def groups(self, machine: Machine) -> tuple[tuple[str, ...], ...]:
+        """Names of sites at which it may be one and the same thing, beside those that the user takes to be alike."""
+        return ()
+
     def edit(self, machine: Machine, site: str) -> Edit | None:
         """What is changed in the MJCF, where parameters of it are not enough."""
         return None
@@ -200,9 +204,12 @@ def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
 
 
 def _together(extension: Extension, sites: tuple[str, ...], machine: Machine) -> Iterator[str]:
-    """Sites that the user takes to be alike: one parameter writes what imitates the extension there."""
-    for parameter in machine.environment.parameters:
-        alike = [site for site in sites if set(parameter.targets) & set(extension.imitators(site))]
+    """Sites at which it is one thing: by its own account, or as one parameter writes what imitates it there."""
+    written = (
+        tuple(site for site in sites if set(parameter.targets) & set(extension.imitators(site)))
+        for parameter in machine.environment.parameters
+    )
+    for alike in dict.fromkeys((*extension.groups(machine), *written)):
         if len(alike) > 1:
             yield _AND.join(alike)
 

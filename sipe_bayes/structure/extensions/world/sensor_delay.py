@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.envs.channels import is_rotation
 from sipe_bayes.structure.extension import Extension, members
 from sipe_bayes.structure.machine import Machine
 
@@ -19,7 +22,8 @@ class SensorDelay(Extension):
 
     def sentence(self, site: str) -> str:
         """What it is."""
-        return f"a delay of the measurement {site}"
+        names = members(site)
+        return f"a delay of the measurement{'s' * (len(names) > 1)} {site if len(names) < 3 else _from_to(names)}"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """Up to a tenth of a second, or twenty samples."""
@@ -28,7 +32,7 @@ class SensorDelay(Extension):
                 f"{site}.delay",
                 0.0,
                 self.memory(machine.dt),
-                targets=tuple(f"sensor:{name}.delay" for name in members(site)),
+                targets=_targets(machine, members(site)),
                 description="age of the measurement",
             ),
         )
@@ -37,6 +41,26 @@ class SensorDelay(Extension):
         """The longest delay."""
         return min(0.1, 20 * dt)
 
+    def groups(self, machine: Machine) -> tuple[tuple[str, ...], ...]:
+        """What one instrument tells: the pose of a body, the numbers of a sensor."""
+        instruments: dict[str, list[str]] = {}
+        for channel in machine.environment.measurements:
+            if not channel.target.startswith("joint:"):
+                instrument = channel.target.rpartition(".")[0] or channel.target.partition("[")[0]
+                instruments.setdefault(instrument, []).append(channel.label)
+        return tuple(tuple(names) for names in instruments.values())
+
     def imitators(self, site: str) -> tuple[str, ...]:
         """A low-pass filter."""
         return tuple(f"sensor:{name}.filter" for name in members(site))
+
+
+def _from_to(names: Sequence[str]) -> str:
+    return f"{names[0]} to {names[-1]}"
+
+
+def _targets(machine: Machine, names: Sequence[str]) -> tuple[str, ...]:
+    """Of an orientation the whole of it has a delay."""
+    turning = {channel.label for channel in machine.environment.measurements if is_rotation(channel)}
+    whole = [name.rpartition("_")[0] if name in turning else name for name in names]
+    return tuple(dict.fromkeys(f"sensor:{name}.delay" for name in whole))
