@@ -154,10 +154,10 @@ class _Model:
     tell: Tell
     extensions: Sequence[Extension] | None = None
 
-    def windows(self, logs: Trajectories) -> Windows:
+    def windows(self, logs: Trajectories, like: Windows | None = None) -> Windows:
         """By which logs are scored and drawn, their columns multiplied as those of the fits were."""
         logs = corrected(logs, self.structures.columns, self.problem.environment.actuators)
-        return Windows(replace(self.problem.segments, fit=None), self.structures.simulator(self.one), logs)
+        return Windows(replace(self.problem.segments, fit=None), self.structures.simulator(self.one), logs, like)
 
     def predicted(self, windows: Windows) -> FloatArray:
         """Predictions (W, L, C) from measured starts."""
@@ -212,7 +212,8 @@ class _Model:
 
 def _errors(use: str, before: _Model, after: _Model, logs: Trajectories) -> list[ModelErrors]:
     """Of logs under the plain model and under the structure, from measured starts and from fitted ones."""
-    plain, extended = before.windows(logs), after.windows(logs)
+    extended = after.windows(logs)
+    plain = before.windows(logs, extended)
     default = np.clip(plain.simulator.space.default_theta, 0, 1)
     old, given = errors(plain, np.stack([before.one.theta, default]))
     (new,) = errors(extended, after.one.theta[None])
@@ -228,7 +229,8 @@ def _errors(use: str, before: _Model, after: _Model, logs: Trajectories) -> list
 
 def _signals(before: _Model, after: _Model, logs: Mapping[str, Trajectories], seed: int) -> list[Signal]:
     """Of the structure, with the calibrated plain model in place of the model as given; logs by their use."""
-    windows, plain = ({use: model.windows(own) for use, own in logs.items()} for model in (after, before))
+    windows = {use: after.windows(own) for use, own in logs.items()}
+    plain = {use: before.windows(own, windows[use]) for use, own in logs.items()}
     predicted = {use: np.stack([after.predicted(windows[use]), before.predicted(plain[use])]) for use in logs}
     theta, posterior = after.one.theta, after.structures.posterior_of(after.one)
     bands = predictive_bands(windows, predicted, theta, posterior, seed)
@@ -238,8 +240,9 @@ def _signals(before: _Model, after: _Model, logs: Mapping[str, Trajectories], se
 def _comparison(problem: Problem, before: _Model, after: _Model) -> Comparison | None:
     if problem.holdout is None or not after.one.labels:
         return None
-    reference = before.windows(problem.holdout), before.one.theta
-    return compare_errors(after.windows(problem.holdout), after.one.theta, reference, fit_starts=True)
+    windows = after.windows(problem.holdout)
+    reference = before.windows(problem.holdout, windows), before.one.theta
+    return compare_errors(windows, after.one.theta, reference, fit_starts=True)
 
 
 def _pieces(structures: Structures) -> tuple[Piece, ...]:

@@ -10,6 +10,7 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 
 _BLOCK, _LEAST_WINDOWS = 4, 2  # windows that stay together where not all are kept; of a log
+_LEFT_OUT = 8  # one in so many of a log's samples
 _SAME_RATE = 1e-3  # relative: logs of one machine whose clocks differ by less have gaps of one length
 
 
@@ -88,15 +89,27 @@ def _rates(dt: FloatArray) -> FloatArray:
     return -alike
 
 
-def leads(remembers: FloatArray, dt: FloatArray, length: IntArray) -> IntArray:
-    """Samples (W, C) after a window's beginning in which a channel tells of what was before; half a log's at most.
+def reached(
+    remembers: FloatArray, late: FloatArray, dt: FloatArray, length: IntArray, start: IntArray
+) -> tuple[IntArray, IntArray]:
+    """How many samples (W, C) after its start a window's predictions begin that tell of it alone, and where they do.
+
+    The second differs where a log begins: no window predicts what tells of the time before, an eighth of the log at
+    most.
 
     Args:
-        remembers: (C,) seconds in which it does.
+        remembers: (C,) seconds in which a channel tells of what was before; half a log's at most.
+        late: (C,) seconds, the same of other models that are compared with this one.
         dt: (W,) seconds between samples.
         length: (W,), control steps of the logs.
+        start: (W,), samples.
     """
-    return np.asarray(np.minimum(np.ceil(remembers / dt[:, None] - 1e-9), length[:, None] // 2), np.int64)
+    lead, out = (
+        np.minimum(np.ceil(x / dt[:, None] - 1e-9).astype(np.int64), length[:, None] // 2)
+        for x in (remembers, np.maximum(remembers, late))
+    )
+    left_out = np.minimum(out, length[:, None] // _LEFT_OUT) - start[:, None]
+    return lead, np.maximum(left_out, np.where(start[:, None], lead, 0))
 
 
 def owned_samples(place: IntArray, stride: IntArray, left: IntArray, known: bool) -> BoolArray:
@@ -123,7 +136,7 @@ def compared_samples(
         stride: (W,), control steps to the beginning of the next window.
         left: (W,), to the end of the log.
         begin: (W, C), the first that it predicts.
-        lead: (W, C), see ``leads``.
+        lead: (W, C), see ``reached``.
         known: whether starts are.
     """
     end, begin = (stride[:, None] + lead)[:, None], begin[:, None]

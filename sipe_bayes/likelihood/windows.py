@@ -26,7 +26,7 @@ from sipe_bayes.core.rotations import nearest, written_near
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_scales, whiten
-from sipe_bayes.likelihood.sequences import Sequence, compared_samples, leads, owned_samples, sequences, spread_blocks
+from sipe_bayes.likelihood.sequences import Sequence, compared_samples, owned_samples, reached, sequences, spread_blocks
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments, chosen_channels, fitted_rotations
 from sipe_bayes.likelihood.starts import (
     STATE_STEP,
@@ -42,7 +42,8 @@ from sipe_bayes.simulation.contacts import Contacts
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import moved
 
-_LEFT_OUT = 8  # one in so many of a log's samples at most, as telling of the time before it
+_BY_SAMPLE = ("owned", "compared", "measured", "observed")  # what a part of the windows has a part of
+_BY_WINDOW = ("log", "start", "stride", "lead", "begin", "steps", "dt", "actions", "reference", *_BY_SAMPLE)
 
 
 @dataclass(frozen=True)
@@ -61,12 +62,15 @@ class Windows:
         settings: of the likelihood.
         simulator: what is calibrated.
         trajectories: the logs.
-        like: windows of these logs, of which only the same are cut.
+        like: windows of these logs, of which only the same samples are compared.
 
     Raises:
         ValueError: for logs that do not fit the simulator or the settings.
     """
 
+    sequences: list[Sequence]
+    lead: IntArray
+    begin: IntArray
     _masked = 0
     _unmasked: BoolArray
 
@@ -84,7 +88,7 @@ class Windows:
                 "starts: 'recorded' needs trajectories with states of this model; use 'estimated' for a measured log"
             )
         self._cut(trajectories, like)
-        self._read_samples(trajectories)
+        self._read_samples(trajectories, like)
 
     @property
     def fitted(self) -> list[str]:
@@ -113,26 +117,25 @@ class Windows:
         self.dt = trajectories.dt[self.log]
         self.names = [(trajectories.names or [None] * len(trajectories))[k] for k in self.log]
 
-    def _read_samples(self, trajectories: Trajectories) -> None:
+    def _read_samples(self, trajectories: Trajectories, like: Windows | None) -> None:
         simulator, environment = self.simulator, self.simulator.environment
-        left, recorded_starts = trajectories.length[self.log] - self.start, self.settings.starts == "recorded"
-        remembers, length = environment.remembers[self.channels], trajectories.length[self.log]
+        length, known = trajectories.length[self.log], self.settings.starts == "recorded"
         late = np.array([dict(self.settings.late).get(name, 0.0) for name in self.fitted])
-        lead, out = (leads(x, self.dt, length) for x in (remembers, np.maximum(remembers, late)))
-        self.steps = np.minimum(self.stride + lead.max(1), left)
+        reach = reached(environment.remembers[self.channels], late, self.dt, length, self.start)
+        self.lead, self.begin = reach if like is None else (like.lead, like.begin)
+        left = length - self.start
+        self.steps = np.minimum(self.stride + self.lead.max(1), left)
         place = np.arange(int(self.steps.max()) + 1)
         sample = self.start[:, None] + place
-        self.owned = owned_samples(place, self.stride, left, recorded_starts)
-        left_out = np.minimum(out, length[:, None] // _LEFT_OUT) - self.start[:, None]
-        begin = np.maximum(left_out, np.where(self.start[:, None], lead, 0))
-        self.compared = compared_samples(place, self.stride, left, begin, lead, recorded_starts)
+        self.owned = owned_samples(place, self.stride, left, known)
+        self.compared = compared_samples(place, self.stride, left, self.begin, self.lead, known)
         clipped = np.minimum(sample, trajectories.length[self.log][:, None])
         self.measured = trajectories.observations[self.log[:, None], clipped][:, :, self.channels]
         self.observed = self.compared & np.isfinite(self.measured)
         self.actions = trajectories.actions[
             self.log[:, None], np.minimum(sample, trajectories.length[self.log][:, None] - 1)
         ][:, :-1]
-        self.sequences: list[Sequence] = sequences(self.observed, sample, self.log, self.dt)
+        self._in_order()
         guesses = {k: estimate_states(simulator, trajectories[k]) for k in np.unique(self.log).tolist()}
         reference = np.stack([guesses[k][s] for k, s in zip(self.log, self.start, strict=True)])
         self.goals = environment.recorded_goals(trajectories.observations[self.log, 0])
@@ -177,41 +180,39 @@ class Windows:
             place = sample - self.start
             own = np.flatnonzero((self.log == log) & (place >= 0) & (place < length))
             self.observed[own, place[own], self.channels.index(channel)] = False
-        for name in ("spread", "rounding"):
-            vars(self).pop(name, None)
         self._subset, self._masked = None, len(samples)
-        self.sequences = sequences(self.observed, self.start[:, None] + np.arange(length), self.log, self.dt)
+        self._in_order()
 
     def beginnings(self, steps: int) -> Windows:
-        """The first control ``steps`` of every window; the windows themselves where none is longer.
+        """The first control ``steps`` of every window, as its latest sensor sees them; itself where none is longer.
 
         Its rollouts are counted by themselves, as if whole.
         """
+        steps += int(self.lead.max())
         if steps >= self.steps.max():
             return self
         view = copy.copy(self)
-        for name in ("spread", "rounding"):
-            vars(view).pop(name, None)
         view.steps, view.actions = np.minimum(self.steps, steps), self.actions[:, :steps]
-        for name in ("owned", "compared", "measured", "observed"):
+        for name in _BY_SAMPLE:
             setattr(view, name, getattr(self, name)[:, : steps + 1])
-        sample = view.start[:, None] + np.arange(steps + 1)
-        view.sequences = sequences(view.observed, sample, view.log, view.dt)
-        return view
+        return view._in_order()
 
     def part(self, keep: IntArray) -> Windows:
         """Some of the windows, by number. Their rollouts are counted by themselves, as if all were simulated."""
         view = copy.copy(self)
-        for name in ("spread", "rounding"):
-            vars(view).pop(name, None)
-        by_window = ("log", "start", "stride", "steps", "dt", "owned", "compared", "measured", "observed")
-        for name in (*by_window, "actions", "reference"):
+        for name in _BY_WINDOW:
             setattr(view, name, getattr(self, name)[keep])
         view.goals = None if self.goals is None else self.goals[keep]
         view.names = [self.names[w] for w in keep]
-        sample = view.start[:, None] + np.arange(view.observed.shape[1])
-        view.sequences = sequences(view.observed, sample, view.log, view.dt)
-        return view
+        return view._in_order()
+
+    def _in_order(self) -> Windows:
+        """After other samples have become those that count."""
+        for name in ("spread", "rounding"):
+            vars(self).pop(name, None)
+        sample = self.start[:, None] + np.arange(self.observed.shape[1])
+        self.sequences = sequences(self.observed, sample, self.log, self.dt)
+        return self
 
     @cached_property
     def spread(self) -> FloatArray:
