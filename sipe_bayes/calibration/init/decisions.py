@@ -140,7 +140,8 @@ def decide(draft: Draft, machine: Machine, trial: Trial, layout: Layout) -> Draf
         return draft
     case = Case(draft, machine, trial, layout, trial.theta)
     ranking = ranked(case, asked)
-    flies = bool(trial.simulator.environment.rotations)  # what its contacts do is not seen in short windows
+    thrust = any(actuator.thrust for actuator in machine.actuators)
+    flies = bool(trial.simulator.environment.rotations) and not thrust  # contacts are not seen in short windows
     rivals = [] if flies else _rivals(ranking, len(trial.given.observed))
     if rivals:
         ranking, theta = _fitted(case, asked, ranking, rivals)

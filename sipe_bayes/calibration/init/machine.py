@@ -56,11 +56,12 @@ class Actuator:
     full: float | None = None
     limits: tuple[float, float] | None = None
     tendon: bool = False
+    thrust: bool = False
 
     @property
     def turns(self) -> bool:
         """Whether it moves something about an axis, else along a line."""
-        return not self.tendon if self.joint is None else self.joint.hinge
+        return not (self.tendon or self.thrust) if self.joint is None else self.joint.hinge
 
     @property
     def one_way(self) -> bool:
@@ -98,6 +99,8 @@ class Machine:
                 full_of(model, i),
                 _limits_of(model, i),
                 int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON),
+                int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_SITE)
+                and bool(model.actuator_gear[i, :3].any()),
             )
             for k, i in enumerate(i for i in range(model.nu) if model.actuator(i).name)
         ]
@@ -148,6 +151,11 @@ class Sizes:
             return {name: max(float(values[i]), least) for name, i in at.items()}
 
         return cls(by_name(force, 1e-9), by_name(speed, 1e-3), by_name(inertia, 1e-12))
+
+
+def _is_thrust(model: mujoco.MjModel, index: int) -> bool:
+    site = int(model.actuator_trntype[index]) == int(mujoco.mjtTrn.mjTRN_SITE)
+    return site and bool(model.actuator_gear[index, :3].any())
 
 
 def drive_of(model: mujoco.MjModel, index: int) -> Drive:

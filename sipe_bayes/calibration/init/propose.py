@@ -14,19 +14,20 @@ from sipe_bayes.calibration.init.absolute import absolute_angles, with_zeros
 from sipe_bayes.calibration.init.columns.match import Match, Matches
 from sipe_bayes.calibration.init.columns.matching import match_columns
 from sipe_bayes.calibration.init.columns.names import TURNS, pieces_of
+from sipe_bayes.calibration.init.contacts import nameless
 from sipe_bayes.calibration.init.decisions import decide
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading, Unknown
 from sipe_bayes.calibration.init.fits import delay_of, fit
 from sipe_bayes.calibration.init.forces import with_forces
+from sipe_bayes.calibration.init.kinematics.poses import with_pose_rates
+from sipe_bayes.calibration.init.kinematics.rates import rates_of, with_evidence_of, with_rates
 from sipe_bayes.calibration.init.machine import Machine, Sizes, touching_bodies
-from sipe_bayes.calibration.init.rates import rates_of, with_evidence_of, with_rates
 from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
 from sipe_bayes.calibration.init.tables import Opened, open_table
 from sipe_bayes.calibration.init.trials import Trial
 from sipe_bayes.calibration.init.unknowns import (
     RELATIVE,
     candidates,
-    nameless,
     roomy,
     scale_is_open,
     springs,
@@ -61,6 +62,7 @@ _LOOKED_AT = 3  # logs that are simulated
 _CHECKED = 60  # logs whose columns are looked at
 _HELD = 0.75  # share of a single log that trains
 _SINGLE, _COUPLED = 0.4, 0.2  # of the time in which the motion goes to and fro, windows of the fit
+_FLOWN = 0.1  # likewise of what thrust carries, which falls over soon
 _LARGEST_BIAS = {"accelerometer": 1.0, "gyro": 0.2}  # m/s^2, rad/s
 _BLIND = 0.5  # s, windows where nothing tells how fast the machine moves
 _TURNING = 24  # windows of the fit of what turns freely: contacts take their time
@@ -289,7 +291,7 @@ def _decided(
     """Units, signs, delay, unknowns and the window's length, by simulations of the logs."""
     draft = replace(draft, unknowns=tuple(rough_unknowns(model, machine, draft.readings)))
     rates = rates_of(draft, model, machine, sources, folder)
-    draft = with_rates(draft, rates)
+    draft = with_pose_rates(with_rates(draft, rates), model, machine, sources, folder)
     part = tried_part(draft)
     rest = tuple(r for r in draft.measurements if r not in part.measurements)
     tell("zeros of joints")
@@ -389,5 +391,6 @@ def _window(machine: Machine, logs: Sequence[Trajectory], trial: Trial) -> tuple
         return "log", "each log as one: they are short"
     swing = trial.length * logs[0].dt / share_of(machine)
     part = _COUPLED if len(machine.joints) > 1 and share_of(machine) < _COUPLED else _SINGLE
+    part = _FLOWN if any(actuator.thrust for actuator in machine.actuators) else part
     length = float(np.clip(part * swing, max(0.1, 20 * logs[0].dt), min(2.0, min(durations) / 5)))
     return float(f"{length:.2g}"), f"s; the motion goes to and fro in about {swing:.2g} s"

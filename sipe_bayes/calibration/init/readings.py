@@ -163,7 +163,7 @@ def _vector(match: Match, table: Table) -> Reading:
 def _command(actuator: Actuator, match: Match, matches: Matches, table: Table) -> Reading:
     hinge = actuator.turns
     force = "N m" if hinge else "N"
-    winch = actuator.tendon and match.label.kind != Kind.TORQUE  # of what no gear tells
+    winch = (actuator.tendon or actuator.thrust) and match.label.kind != Kind.TORQUE  # of what no gear tells
     of_force = "1" if winch or match.label.kind == Kind.SETPOINT else force  # set is what is no force: a pressure
     default = {
         Drive.FORCE: {Kind.CURRENT: "A", Kind.VOLTAGE: "V"}.get(match.label.kind, of_force),

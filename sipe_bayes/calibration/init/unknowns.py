@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import takewhile
 
 import mujoco
 import numpy as np
 
 from sipe_bayes.calibration.init.columns.names import Kind
+from sipe_bayes.calibration.init.contacts import contacts, word_of
 from sipe_bayes.calibration.init.draft import Reading, Unknown
 from sipe_bayes.calibration.init.fits import Fit, rounded_up
 from sipe_bayes.calibration.init.machine import (
@@ -19,14 +18,10 @@ from sipe_bayes.calibration.init.machine import (
     Joint,
     Machine,
     Sizes,
-    counts,
-    friction_of,
-    own_friction,
-    top_of,
-    touched_by,
 )
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.envs.inertia import body_frame_inertia
 from sipe_bayes.envs.sensing import of_sensor
 from sipe_bayes.envs.targets import bind
 
@@ -74,9 +69,33 @@ def candidates(
     of_joints = [u for joint in joints for u in _of_joint(model, joint, sizes)]
     if open_scale and len(joints) < 2:  # a rotor is so much more mass, to which the gain is relative
         of_joints = [u for u in of_joints if not u.name.endswith("_armature")]
-    proposed = gains + masses + of_joints + attached + _zeros(readings)
-    proposed += _contacts(model, {*bodies, *touching})
+    flown = [body for body in bodies if body in {_thrust_at(model, a) for a, _ in driven}]
+    shapes = [unknown for body in flown for unknown in _of_flown(model, body)]
+    proposed = gains + masses + shapes + of_joints + attached + _zeros(readings)
+    proposed += contacts(model, {*bodies, *touching})
     return proposed or _masses(model, bodies)[0]
+
+
+def _thrust_at(model: mujoco.MjModel, actuator: Actuator) -> int:
+    """The id of the body that an actuator at a site pushes; 0 of others."""
+    site = int(model.actuator_trnid[model.actuator(actuator.name).id, 0])
+    return int(model.body_weldid[model.site_bodyid[site]]) if actuator.thrust else 0
+
+
+def _of_flown(model: mujoco.MjModel, body: int) -> list[Unknown]:
+    """Inertia and centre of mass of what thrust alone turns."""
+    name, own = model.body(body).name, np.diag(body_frame_inertia(model, body))
+    at, word = f"body:{name}", word_of(name)
+    half = float(f"{np.sqrt(own.mean() / max(float(model.body_mass[body]), 1e-9)) / 2:.1g}")
+    inertia = [
+        _factor(f"{word}_inertia_{x}", f"{at}.inertia_{x}{x}", 0.4, 2.5, f"{value:.3g} kg m^2 in the model")
+        for x, value in zip("xyz", own, strict=True)
+    ]
+    centre = [
+        Unknown(f"{word}_com_{x}", (f"{at}.com_{x}",), value - half, value + half, False, "centre of mass")
+        for x, value in zip("xyz", np.round(model.body_ipos[body], 4).tolist(), strict=True)
+    ]
+    return [*inertia, *centre]
 
 
 def _zeros(readings: Sequence[Reading]) -> list[Unknown]:
@@ -84,7 +103,7 @@ def _zeros(readings: Sequence[Reading]) -> list[Unknown]:
     shared = {r.unsure for r in readings if r.commanded}
     return [
         Unknown(
-            f"{_word(r.match.column)}_zero", (f"sensor:{r.match.column}.bias",), -r.unsure, r.unsure, False,
+            f"{word_of(r.match.column)}_zero", (f"sensor:{r.match.column}.bias",), -r.unsure, r.unsure, False,
             f"SI, what is left of the zero error of {r.match.column!r}",
         )
         for r in readings if r.unsure and r.unsure not in shared
@@ -98,7 +117,7 @@ def springs(model: mujoco.MjModel, machine: Machine, readings: Sequence[Reading]
     soft = [j for j in joints if not float(np.ravel(model.joint(j.name).stiffness)[0])]
     return [
         Unknown(
-            f"{_word(joint.name)}_spring", (f"joint:{joint.name}.stiffness",), 0.0,
+            f"{word_of(joint.name)}_spring", (f"joint:{joint.name}.stiffness",), 0.0,
             _STIFF * sizes.force[joint.name] * (1.0 if joint.hinge else _PER_METRE), False, _SPRING,
         )
         for joint in soft
@@ -123,7 +142,7 @@ def _of_actuator(model: mujoco.MjModel, actuator: Actuator, reading: Reading) ->
     name, at = actuator.name, f"actuator:{actuator.name}"
     index = model.actuator(name).id
     gain, (_, _, of_velocity) = float(model.actuator_gainprm[index, 0]), model.actuator_biasprm[index, :3]
-    word = _word(name)
+    word = word_of(name)
     if int(model.actuator_gaintype[index]) == int(mujoco.mjtGain.mjGAIN_DCMOTOR):
         constant, kp = float(model.actuator_gainprm[index, 1]), float(model.actuator_gainprm[index, 4])
         own = [_factor(f"{word}_resistance", f"{at}.resistance", 0.5, 2.0, f"{gain:g} Ohm in the model")]
@@ -156,7 +175,7 @@ def _lag_of(model: mujoco.MjModel, actuator: Actuator) -> list[Unknown]:
     if int(model.actuator_dyntype[index]) not in map(int, filters) or not tau > 0:
         return []
     target, note = f"actuator:{actuator.name}.lag", f"time constant of its filter, {tau:g} s in the model"
-    unknown = _factor(f"{_word(actuator.name)}_lag", target, 0.2, 5.0, note)
+    unknown = _factor(f"{word_of(actuator.name)}_lag", target, 0.2, 5.0, note)
     low = max(unknown.low, _least(model, unknown))  # of Euler's steps a step
     return [replace(unknown, low=low)] if low < 1 else []
 
@@ -176,7 +195,7 @@ def _masses(model: mujoco.MjModel, bodies: Sequence[int]) -> tuple[list[Unknown]
             mass, name = float(model.body_mass[body]), model.body(body).name
             if mass > 0 and name:
                 note = f"{mass:g} kg in the model" + (f", attached to {model.body(by_mass[0]).name}" if k else "")
-                unknown = _factor(f"{_word(name)}_mass", f"body:{name}.mass", 0.5, 2.0, note)
+                unknown = _factor(f"{word_of(name)}_mass", f"body:{name}.mass", 0.5, 2.0, note)
                 (attached if k else heaviest).append(unknown)
     return heaviest, attached
 
@@ -188,7 +207,7 @@ def _of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes) -> list[Unknown
     damping, dry, rotor = (
         float(getattr(model, f"dof_{field}")[dof]) for field in ("damping", "frictionloss", "armature")
     )
-    word = _word(name)
+    word = word_of(name)
     rows = (
         ("damping", rounded_up(max(4 * damping, 0.5 * force / speed)), damping, "viscous friction"),
         ("frictionloss", rounded_up(max(4 * dry, 0.4 * force)), dry, "dry friction"),
@@ -201,96 +220,6 @@ def _of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes) -> list[Unknown
     if (spring := float(np.ravel(model.joint(name).stiffness)[0])) > 0:
         out.append(_factor(f"{word}_stiffness", f"{at}.stiffness", 0.5, 2.0, f"spring, {spring:g} in the model"))
     return out
-
-
-def _contacts(model: mujoco.MjModel, tops: set[int]) -> list[Unknown]:
-    """Friction and bounce of bodies, and of what moves with them, with what stands still.
-
-    Geoms whose friction with it is one number share a parameter: wheels, feet.
-    """
-    touching = {g: s for g in range(model.ngeom) if top_of(model, g, tops) and (s := touched_by(model, g))}
-    groups: dict[tuple[float, ...], list[int]] = {}
-    for geom, still in touching.items():
-        groups.setdefault(tuple(friction_of(model, geom, s) for s in still), []).append(geom)
-    leaning: list[set[int]] = [
-        {s for g in group for s in touching[g] if counts(model, s, g)} for group in groups.values()
-    ]
-    out: list[Unknown] = []
-    taken: set[int] = set()
-    for k, group in enumerate(groups.values()):
-        others = taken.union(*leaning[:k], *leaning[k + 1 :])
-        decides = {s for s in leaning[k] - taken if friction_of(model, group[0], s) <= own_friction(model, s)}
-        still = sorted(decides | (leaning[k] - others))
-        taken |= {*still}
-        own = [g for g in group if any(counts(model, g, s) for s in touching[g])]
-        least = max((own_friction(model, s) for s in leaning[k] - {*still}), default=_SLIPPERY)
-        bodies = {int(model.geom_bodyid[g]) for g in group}
-        above = [top_of(model, g, tops) for g in group] if bodies & tops or len(groups) == 1 else sorted(bodies)
-        name = f"{_shared(model, above)}_friction"
-        name += f"_{k + 1}" * any(unknown.name == name for unknown in out)
-        given, what = [own_friction(model, g) for g in (*own, *still)], _mixed(own, still, least)
-        span = min([least, *given]), max([1.5, 2 * least, *given])  # what the model has lies within
-        out += _of_geoms(model, name, "friction", (own, still), span, what)
-    if touching:
-        every = (sorted(touching), sorted({s for still in touching.values() for s in still}))
-        word, step = _shared(model, [top_of(model, g, tops) for g in touching]), float(model.opt.timestep)
-        spans = {"timeconst": (rounded_up(2 * step), max(0.05, rounded_up(10 * step))), "dampratio": (0.1, 1.5)}
-        says = {
-            "timeconst": "of the contact: the shorter the harder",
-            "dampratio": "of the contact: below 1 it bounces",
-        }
-        for key, span in spans.items():
-            out += _of_geoms(model, f"{word}_solref_{key}", f"solref_{key}", every, span, says[key])
-    return out
-
-
-def nameless(model: mujoco.MjModel, tops: set[int]) -> list[str]:
-    """What is to be said of bodies of which no geom that may touch what stands still has a name."""
-    named: dict[int, bool] = {}
-    for geom in range(model.ngeom):
-        if (top := top_of(model, geom, tops)) and touched_by(model, geom):
-            named[top] = named.get(top, False) or bool(model.geom(geom).name)
-    names = ", ".join(model.body(top).name for top, any_named in named.items() if not any_named)
-    return [f"friction of {names} is not asked for: no geom of it that may touch something has a name"] if names else []
-
-
-def _of_geoms(
-    model: mujoco.MjModel,
-    name: str,
-    field: str,
-    geoms: tuple[Sequence[int], Sequence[int]],
-    span: tuple[float, float],
-    what: str,
-) -> list[Unknown]:
-    """One number of geoms that move and of those that stand still; nothing where all of one sort have no name."""
-    named = [[model.geom(g).name for g in part if model.geom(g).name] for part in geoms]
-    if any(part and not names for part, names in zip(geoms, named, strict=True)):
-        return []
-    missing = sum(map(len, geoms)) - sum(map(len, named))
-    what += f"; {missing} geoms are left out that have no name" if missing else ""
-    return [Unknown(name, tuple(f"geom:{n}.{field}" for part in named for n in part), *span, False, what)]
-
-
-def _mixed(own: Sequence[int], still: Sequence[int], least: float) -> str:
-    """Whose friction MuJoCo takes of geoms that touch: that of the higher priority, else the larger."""
-    if own and still:
-        return "sliding friction; both sides are named: MuJoCo takes the larger one where their priority is the same"
-    if own and least > _SLIPPERY:
-        return (
-            f"sliding friction, of which MuJoCo takes the larger one: no less than the {least:g} of what stands still"
-        )
-    return "sliding friction; the other side has a lower priority and does not count"
-
-
-def _shared(model: mujoco.MjModel, bodies: Sequence[int]) -> str:
-    """What the names of bodies begin with, or the first of them."""
-    names = [model.body(body).name for body in bodies]
-    begin = "".join(letters[0] for letters in takewhile(lambda x: len(set(x)) == 1, zip(*names, strict=False)))
-    return _word((begin.rstrip("_-. 0123456789") if len(set(names)) > 1 else begin) or next(filter(None, names), ""))
-
-
-def _word(name: str) -> str:
-    return re.sub(r"\W+", "_", name).strip("_") or "unknown"
 
 
 def as_parameters(model: mujoco.MjModel, unknowns: Sequence[Unknown]) -> list[Parameter]:

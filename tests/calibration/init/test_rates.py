@@ -11,7 +11,7 @@ import pytest
 
 from sipe_bayes.calibration.init.decisions import missing_more
 from sipe_bayes.calibration.init.draft import Draft, Reading, Scale
-from sipe_bayes.calibration.init.gyros import Gyro, hinges_of
+from sipe_bayes.calibration.init.kinematics.gyros import Gyro, hinges_of
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.write import toml_of
 from sipe_bayes.core.arrays import FloatArray

@@ -295,6 +295,10 @@ def _by_number(machine: Machine, families: Families, labels: list[Label]) -> tup
     def likeness(stem: str) -> float:
         return max(alike(as_many[stem][0].words, actuator.name) for actuator in machine.actuators)
 
+    own = {actuator.name.lower() for actuator in machine.actuators}
+    for stem, family in as_many.items():
+        if {x.column.lower() for x in family} == own:
+            return stem, []
     chosen, *others = sorted(as_many, key=likeness, reverse=True)
     names = {stem: ", ".join(repr(x.column) for x in family) for stem, family in as_many.items()}
     rivals = "".join(f"; or are these: {names[stem]}?" for stem in others)

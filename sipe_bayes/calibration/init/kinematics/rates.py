@@ -16,7 +16,7 @@ import numpy as np
 
 from sipe_bayes.calibration.init.draft import Draft, Reading, Scale
 from sipe_bayes.calibration.init.draft import unit_words as words_of
-from sipe_bayes.calibration.init.gyros import Gyro, Turned, hinges_of
+from sipe_bayes.calibration.init.kinematics.gyros import Gyro, Turned, hinges_of
 from sipe_bayes.calibration.init.machine import Machine
 from sipe_bayes.calibration.init.readings import counts_of
 from sipe_bayes.calibration.init.windows import Source, loaded

@@ -1,0 +1,1 @@
+"""What kinematics alone tell of columns, without simulations."""
