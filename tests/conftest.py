@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 
 import pytest
 
+gc.set_threshold(20_000, 10, 10)  # so that looking for cycles of garbage takes no sixth of the suite's time
 os.environ["MUJOCO_GL"] = "disabled"  # nothing is rendered but where a test asks for it
 os.environ["SIPE_TRUST_MODELS"] = "1"  # a process for each model takes half a second; its own tests unset it
 

@@ -25,7 +25,7 @@ from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure import probes
-from tests.problems.swings import command, environment, strict_json, swing, text, write_case
+from tests.problems.swings import call, command, environment, strict_json, swing, text, write_case
 
 
 def reported(calibration: Calibration) -> dict[str, object]:
@@ -71,6 +71,12 @@ def problem(tmp_path: Path) -> Problem:
     return prepare(write_case(tmp_path, swing()), 1)
 
 
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
+    """Of ``problem``, which nobody stopped."""
+    return calibrate(prepare(write_case(tmp_path_factory.mktemp("undisturbed"), swing()), 1))
+
+
 @pytest.fixture
 def apart(tmp_path: Path) -> Problem:
     """Two logs that disagree: the torque of the second is logged 1.2 times too small."""
@@ -80,9 +86,7 @@ def apart(tmp_path: Path) -> Problem:
     return prepare(config, 1)
 
 
-def test_a_run_that_is_stopped_in_every_check(
-    problem: Problem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_is_stopped_in_every_check(problem: Problem, undisturbed: Calibration, tmp_path: Path) -> None:
     """Each time it goes on with that one, and in the end says what one says that nobody stopped."""
     checkpoint, count = tmp_path / "out" / "checkpoint.safetensors", len(Check)
     for number in range(1, count + 1):
@@ -92,8 +96,7 @@ def test_a_run_that_is_stopped_in_every_check(
             calibrate(problem, checkpoint=checkpoint, progress=progress)
         begun = list(dict.fromkeys(what.partition(",")[0] for what in progress.heard))
         assert begun == [f"check {k} of {count}" for k in range(max(number - 1, 1), number + 1)]
-    resumed = calibrate(problem, checkpoint=checkpoint)
-    assert reported(resumed) == reported(calibrate(problem))
+    assert reported(calibrate(problem, checkpoint=checkpoint)) == reported(undisturbed)
 
 
 def test_nothing_is_simulated_again(problem: Problem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,15 +140,14 @@ def test_logs_are_not_fitted_again(apart: Problem, tmp_path: Path, monkeypatch: 
     assert reported(resumed) == reported(calibrate(apart))
 
 
-def test_checks_of_another_fit_are_made_again(problem: Problem, tmp_path: Path) -> None:
+def test_checks_of_another_fit_are_made_again(problem: Problem, undisturbed: Calibration, tmp_path: Path) -> None:
     """In the same folder: of a fit that a larger budget let go on, and of files that are damaged."""
     folder = tmp_path / "out"
-    whole = calibrate(problem)
-    calibrate(problem, budget=whole.rollouts - 3, checkpoint=folder / "checkpoint.safetensors")
-    assert reported(calibrate(problem, checkpoint=folder / "checkpoint.safetensors")) == reported(whole)
+    calibrate(problem, budget=undisturbed.rollouts - 3, checkpoint=folder / "checkpoint.safetensors")
+    assert reported(calibrate(problem, checkpoint=folder / "checkpoint.safetensors")) == reported(undisturbed)
     for file in (folder / "checks").iterdir():
         file.write_bytes(file.read_bytes()[:-3])
-    assert reported(calibrate(problem, checkpoint=folder / "checkpoint.safetensors")) == reported(whole)
+    assert reported(calibrate(problem, checkpoint=folder / "checkpoint.safetensors")) == reported(undisturbed)
 
 
 @pytest.mark.parametrize("case", ["problem", "apart"])
@@ -197,8 +199,8 @@ def test_killed_in_its_checks(tmp_path: Path) -> None:
     finally:
         process.kill()
     assert not (broken / "result.json").exists()
-    ended = subprocess.run(command(config, "--out", broken, "--threads", 2), **quiet, check=False)
-    assert ended.returncode == 0, ended.stderr
+    ended = call(config, "--out", broken)  # with two threads
+    assert ended.exit_code == 0, ended.output
     undisturbed = CliRunner().invoke(
         app, ["calibrate", str(config), "--out", str(tmp_path / "whole"), "--threads", "1"]
     )

@@ -106,22 +106,23 @@ def test_windows_lose_no_information_that_the_starts_do_not_take() -> None:
 
 
 def test_coloured_noise_widens_and_covers() -> None:
-    """24 logs with rho .9.
+    """16 logs with rho .9.
 
-    The 90 % interval of the offset holds the truth in 17 or more (a right width fails with probability 0.2 %); white
-    noise's intervals hold it in fewer than 17.
+    The 90 % interval of the offset holds the truth in 11 or more (a right width fails with probability 0.3 %); white
+    noise's intervals hold it in fewer than 11.
     """
     simulator = cart()
     covered = {"ar1": 0, "sandwich": 0, "white": 0}
-    for seed in range(24):
+    for seed in range(16):
         trajectory, theta = cart_log(simulator, 100 + seed, rho=0.9)
         for kind in covered:
             fit = get_estimator(simulator, "laplace", likelihood=Segments(None, noise=kind), restarts=1, candidates=0)
             low, high = fit.fit(trajectory).quantile(torch.tensor([0.05, 0.95])).numpy()[:, 0]
             covered[kind] += low <= theta[0] <= high
-    assert covered["ar1"] >= 17, covered
-    assert covered["sandwich"] >= 17, covered
-    assert covered["white"] < 17, covered
+    print(covered)
+    assert covered["ar1"] >= 11, covered
+    assert covered["sandwich"] >= 11, covered
+    assert covered["white"] < 11, covered
 
 
 def test_wrong_input() -> None:

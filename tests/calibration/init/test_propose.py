@@ -18,7 +18,7 @@ from sipe_bayes.cli.app import app
 from tests.problems.log_tables import EXAMPLES
 from tests.problems.made_up_logs import KINDS, PENDULUM, Truth, make_log
 
-LOGS = [(kind, variant) for k, kind in enumerate(KINDS) for variant in range(5) if (k + variant) % 2 == 0]
+LOGS = [(kind, variant) for k, kind in enumerate(KINDS) for variant in ((0, 2), (1, 3), (2, 4), (1, 3))[k]]
 
 
 def wrong(draft: Draft, truth: Truth) -> list[str]:
@@ -44,8 +44,8 @@ def wrong(draft: Draft, truth: Truth) -> list[str]:
     return out
 
 
-def test_units_signs_and_delays_of_ten_logs(tmp_path: Path) -> None:
-    """Each kind of machine in two or three of the variants, and each variant twice: all come out."""
+def test_units_signs_and_delays_of_eight_logs(tmp_path: Path) -> None:
+    """Each kind of machine in two of the variants, and each variant once or twice: all come out."""
     mistakes = {}
     for seed, (kind, variant) in enumerate(LOGS):
         folder = tmp_path / f"{kind}{variant}"

@@ -19,7 +19,7 @@ from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 
 LEVEL = 0.05
-ROD = """<mujoco><option timestep="0.002"/><worldbody><body name="rod"><joint name="hinge" axis="0 1 0" {limit}/>
+ROD = """<mujoco><option timestep="0.005"/><worldbody><body name="rod"><joint name="hinge" axis="0 1 0" {limit}/>
   <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass=".5" contype="0" conaffinity="0"/><site name="tip"/>
 </body></worldbody><actuator><motor name="motor" joint="hinge"/></actuator>
 <sensor><framexaxis name="axis" objtype="site" objname="tip"/></sensor></mujoco>"""

@@ -99,13 +99,13 @@ def test_what_no_channel_depends_on_stays_where_it_is() -> None:
 
 
 def test_intervals_hold_the_truth_where_cosine_and_sine_are_measured() -> None:
-    """Eight logs of the Pendulum, truths from the prior.
+    """Six logs of the Pendulum, truths from the prior.
 
-    Of the 24 intervals of 90 % at least 18 hold the truth (right ones fail with probability 1 %, were they
+    Of the 18 intervals of 90 % at least 13 hold the truth (right ones fail with probability 0.6 %, were they
     independent), and the inferred noise is that of the logs.
     """
     rng, covered = np.random.default_rng(5), 0
-    for seed in range(8):
+    for seed in range(6):
         theta = rng.uniform(0, 1, 3)
         simulator, log = swing(theta, 100 + seed)
         estimator = Laplace(simulator, likelihood=StateSpace(), restarts=1, candidates=4)
@@ -113,4 +113,5 @@ def test_intervals_hold_the_truth_where_cosine_and_sine_are_measured() -> None:
         covered += int(((low <= theta) & (theta <= high)).sum())
         ratio = np.array(estimator.diagnostics["noise_sd"]) / (0.01 * log.observations.std(0))
         assert ((ratio > 0.6) & (ratio < 1.5)).all(), ratio
-    assert covered >= 18, covered
+    print(covered)
+    assert covered >= 13, covered
