@@ -14,6 +14,12 @@ os.environ["SIPE_TRUST_MODELS"] = "1"  # a process for each model takes half a s
 
 
 @pytest.fixture
+def unreported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Calibrations of this process write no report, which takes longer than a small fit and has tests of its own."""
+    monkeypatch.setattr("sipe_bayes.calibration.output.write_report", lambda *_: None)
+
+
+@pytest.fixture
 def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The file of a cart's calibration, in the working directory; estimators half and twice as wide are registered."""
     from sipe_bayes.inference.registry import ESTIMATORS

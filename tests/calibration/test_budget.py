@@ -7,6 +7,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import pytest
 import torch
 
 from sipe_bayes.calibration.gathered import Marginals, most_probable
@@ -21,6 +22,7 @@ from tests.problems.made_up_logs import PENDULUM
 from tests.problems.swings import swing, write_case
 
 
+@pytest.mark.usefixtures("unreported")
 def test_a_larger_budget_goes_on_in_the_same_folder(tmp_path: Path) -> None:
     config = write_case(tmp_path, swing())
     whole = run(config, budget=4000, out=tmp_path / "whole")

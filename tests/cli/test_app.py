@@ -207,6 +207,7 @@ def test_state_space_leaves_out_what_does_not_apply_and_says_so(tmp_path: Path, 
     assert refused.stderr.count("\n") == 1
 
 
+@pytest.mark.usefixtures("unreported")
 def test_the_spread_of_a_search_is_not_trusted(tmp_path: Path, log: pd.DataFrame) -> None:
     config = write_case(tmp_path, log)
     result = call(config, "--estimator", "cem", "--budget", 200, "--out", tmp_path / "out")
@@ -218,6 +219,7 @@ def test_the_spread_of_a_search_is_not_trusted(tmp_path: Path, log: pd.DataFrame
     assert set(found["doubts"]) <= set(found["warnings"])
 
 
+@pytest.mark.usefixtures("unreported")
 def test_a_log_outside_the_prior_is_a_doubt(tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch) -> None:
     outside = OutsidePrior(0.01, "log", "angle", 1.0)
     monkeypatch.setattr("sipe_bayes.calibration.checks.predictions.outside_prior", lambda *_, **__: [outside])
@@ -227,6 +229,7 @@ def test_a_log_outside_the_prior_is_a_doubt(tmp_path: Path, log: pd.DataFrame, m
     assert strict_json((tmp_path / "out" / "result.json").read_text())["doubts"] == [outside.text]
 
 
+@pytest.mark.usefixtures("unreported")
 def test_a_log_that_the_model_follows_is_no_doubt(
     tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -270,6 +273,7 @@ def test_logs_that_differ_have_an_interval_for_a_further_one(tmp_path: Path, log
     assert high - low > 3 * (mass["q95"] - mass["q05"])
 
 
+@pytest.mark.usefixtures("unreported")
 @pytest.mark.parametrize("part", ["lacking.ProbedLogs", "predictions.outside_prior"])
 def test_a_check_that_fails_is_one_warning(
     part: str, tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch
@@ -285,6 +289,7 @@ def test_a_check_that_fails_is_one_warning(
 # A killed run
 
 
+@pytest.mark.usefixtures("unreported")
 def test_killed_run_resumes_to_the_same_posterior(tmp_path: Path, log: pd.DataFrame) -> None:
     """A kill -9 in the middle of the chain; the same command again gives bit for bit what nobody disturbed gives.
 

@@ -92,7 +92,7 @@ def test_the_mass_length_ridge_of_a_pendulum_is_named(estimator: str) -> None:
         Parameter("distance", -0.4, -0.15, targets=("body:rod.com_z",)),
         Parameter("armature", 0.0, 0.05, targets=("joint:hinge.armature",)),
     )
-    trajectory = log(simulator, [0.6, 0.05, -0.25, 0.01], 1)
+    trajectory = log(simulator, [0.6, 0.05, -0.25, 0.01], 1, steps=200)
     posterior = get_estimator(simulator, estimator, budget=3000).fit(trajectory)
     draws = posterior.values(4000)
     prior_sd = np.array([p.high - p.low for p in simulator.space]) / np.sqrt(12)

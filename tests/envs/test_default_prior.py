@@ -15,7 +15,6 @@ import pytest
 import sipe_bayes as sipe
 from sipe_bayes.calibration.config_fields import ConfigError
 from sipe_bayes.calibration.run import run
-from sipe_bayes.report import page as report
 
 MODEL = """
 <mujoco>
@@ -93,7 +92,7 @@ def config(folder: Path, name: str, logs: list[int], parameters: str, unit: str 
 def unreported() -> Iterator[None]:
     """Reports, which take longer than these fits, have tests of their own."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(report, "write_report", lambda *_: None)
+        patched.setattr("sipe_bayes.calibration.output.write_report", lambda *_: None)
         yield
 
 

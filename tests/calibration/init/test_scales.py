@@ -22,11 +22,11 @@ from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.settings import StateSpace
 from sipe_bayes.simulation.simulator import Simulator
 
-DRIVE = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="rod">
+DRIVE = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody><body name="rod">
   <joint name="shaft" axis="0 1 0" damping=".002"/>
   <geom type="capsule" fromto="0 0 0 0 0 -.2" size=".01" mass=".2"/></body></worldbody><actuator>
   <dcmotor name="motor" joint="shaft" resistance="1" motorconst=".1"/></actuator></mujoco>"""
-ROCKING = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+ROCKING = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
   <geom type="plane" size="3 3 .1"/><body name="trunk" pos="0 0 .05"><freejoint/>
   <geom type="box" size=".1 .1 .05" mass="1"/><site name="imu"/>
   <body name="rod" pos="0 0 .05"><joint name="arm" axis="0 1 0" damping=".05"/>
@@ -114,7 +114,7 @@ def test_an_inertial_unit_that_alone_tells_of_a_body_is_fitted_with_its_biases(t
         mujoco.mj_forward(model, data)
         data.ctrl[0] = 0.8 * np.sin(0.06 * k)
         rows.append([0.01 * k, data.ctrl[0], data.qpos[7], *data.sensordata])
-        mujoco.mj_step(model, data, 5)
+        mujoco.mj_step(model, data, 2)
     axes = [f"{sensor}_{axis}" for sensor in ("gyro", "acc") for axis in "xyz"]
     pd.DataFrame(rows, columns=["time", "goal_arm", "arm", *axes]).to_csv(tmp_path / "log.csv", index=False)
     (tmp_path / "model.xml").write_text(ROCKING)

@@ -12,9 +12,9 @@ from tests.problems.hung import hung, hung_log
 
 
 def test_what_nothing_measures_is_followed() -> None:
-    """Of 12 intervals of 90 % at least 8 hold the truth (right ones fail with probability 0.4 %)."""
+    """Of 9 intervals of 90 % at least 6 hold the truth (right ones fail with probability 0.8 %)."""
     rng, covered = np.random.default_rng(3), 0
-    for seed in range(12):
+    for seed in range(9):
         theta = rng.uniform(0.1, 0.9, 1)
         estimator = Laplace(hung(), likelihood=StateSpace(starts="recorded"), restarts=1, candidates=0)
         posterior = estimator.fit(hung_log(theta, seed))
@@ -22,7 +22,8 @@ def test_what_nothing_measures_is_followed() -> None:
         covered += int(low[0] <= theta[0] <= high[0])
         print(theta, posterior.mean.numpy(), posterior.stddev.numpy(), estimator.warnings)
         assert float(posterior.stddev[0]) < 0.1
-    assert covered >= 8
+    print(covered)
+    assert covered >= 6
 
 
 def test_a_known_start_costs_two_fifths_of_the_budget_at_most() -> None:
