@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sipe_bayes.calibration.init.columns.match import Match, Matches
-from sipe_bayes.calibration.init.columns.names import Kind, read_name
+from sipe_bayes.calibration.init.columns.names import Kind, pieces_of, read_name
 from sipe_bayes.calibration.init.columns.signals import Slope, likeness, slope_of, turn_of, white_share
 from sipe_bayes.calibration.init.draft import Reading, Scale
 from sipe_bayes.calibration.init.machine import Actuator, Drive, Machine
@@ -59,7 +59,7 @@ def first_readings(
 ) -> tuple[tuple[Reading, ...], tuple[Reading, ...]]:
     """Measurements and commands as names and numbers alone tell them."""
     positions = [_position(machine, m, table, turns) for m in matches.positions]
-    positions = [_by_velocity(reading, matches, table, clock) for reading in positions]
+    positions = [_by_velocity(reading, matches, table, clock) for reading in counting_alike(positions, machine)]
     vectors = [_vector(m, table) for m in matches.vectors]
     velocities = [Reading(m, _unit(m, _joint_unit(machine, m, "/s"))) for m in matches.velocities]
     drives = {f"actuator:{actuator.name}": actuator for actuator in machine.actuators}
@@ -104,6 +104,29 @@ def _counts(values: FloatArray) -> tuple[Scale, ...]:
         return ()
     turns = (_LEAST_TURN, _MOST_TURNS)
     return tuple(Scale("rev", 1 / n) for n in _COUNTS if turns[0] < span / n < turns[1])
+
+
+def counting_alike(positions: Sequence[Reading], machine: Machine) -> list[Reading]:
+    """Positions of which columns that are called alike but for their joints count alike."""
+    owners = {
+        f"joint:{joint.name}.position": {*pieces_of(joint.name), *pieces_of(joint.body)} for joint in machine.joints
+    }
+
+    def stem(reading: Reading) -> tuple[str, ...]:
+        return tuple(
+            p for p in pieces_of(reading.match.column) if p not in owners[reading.match.target] and not p.isdigit()
+        )
+
+    left: dict[tuple[str, ...], set[Scale]] = {}
+    for reading in positions:
+        if reading.scales and stem(reading):
+            left[stem(reading)] = left.get(stem(reading), {*reading.scales}) & {*reading.scales}
+    out = []
+    for reading in positions:
+        scales = tuple(scale for scale in reading.scales if scale in left.get(stem(reading), ()))
+        alike = replace(reading, unit=scales[0].unit, factor=scales[0].factor, scales=scales) if scales else reading
+        out.append(alike)
+    return out
 
 
 def counts_of(scales: Sequence[Scale]) -> tuple[Scale, ...]:

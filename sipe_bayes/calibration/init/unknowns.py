@@ -60,7 +60,7 @@ def candidates(
     measured = {r.match.target.removeprefix("joint:").rpartition(".")[0] for r in readings if not r.commanded}
     joints = [joint for joint in machine.joints if joint.name in measured]
     driven = _driven(machine, readings)
-    gains = [unknown for a, r in driven for unknown in (*_of_actuator(model, a, r), *_lag_of(model, a))]
+    gains = _shared_by_rotors([u for a, r in driven for u in (*_of_actuator(model, a, r), *_lag_of(model, a))], driven)
     open_scale = scale_is_open(model, machine, readings)
     behind = [int(model.joint(joint.name).bodyid[0]) for joint in joints]
     bodies = [model.body(body).id for body in machine.bodies]  # what is pushed, or carries joints
@@ -74,6 +74,22 @@ def candidates(
     proposed = gains + masses + shapes + of_joints + attached + _zeros(readings)
     proposed += contacts(model, {*bodies, *touching})
     return proposed or _masses(model, bodies)[0]
+
+
+def _shared_by_rotors(gains: list[Unknown], driven: Sequence[tuple[Actuator, Reading]]) -> list[Unknown]:
+    """Gains of rotors that are alike in the model as one: each by itself, they show as a centre of mass does."""
+    rotors = {f"actuator:{actuator.name}.gain" for actuator, _ in driven if actuator.thrust}
+    alike: dict[str, list[Unknown]] = {}
+    for unknown in gains:
+        if rotors.issuperset(unknown.targets):
+            alike.setdefault(unknown.note, []).append(unknown)
+    shared = [some for some in alike.values() if len(some) > 1]
+    single = [unknown for unknown in gains if not any(unknown in some for some in shared)]
+    every = [
+        replace(some[0], name=f"rotors_gain_{k}" if k else "rotors_gain", targets=tuple(u.targets[0] for u in some))
+        for k, some in enumerate(shared)
+    ]
+    return [*every, *single]
 
 
 def _thrust_at(model: mujoco.MjModel, actuator: Actuator) -> int:

@@ -10,9 +10,13 @@ import pandas as pd
 import pytest
 
 from sipe_bayes.calibration.config import load_config
+from sipe_bayes.calibration.init.columns.match import Match
+from sipe_bayes.calibration.init.columns.names import read_name
 from sipe_bayes.calibration.init.decisions import as_well
-from sipe_bayes.calibration.init.draft import Draft, Scale
+from sipe_bayes.calibration.init.draft import Draft, Reading, Scale
+from sipe_bayes.calibration.init.machine import Machine
 from sipe_bayes.calibration.init.propose import propose
+from sipe_bayes.calibration.init.readings import counting_alike
 from sipe_bayes.calibration.init.write import toml_of
 from sipe_bayes.calibration.problem import prepare
 from sipe_bayes.calibration.readers.base import LogError
@@ -148,3 +152,21 @@ def test_what_may_be_right_as_well_stands_in_one_line(
 ) -> None:
     """The nearest first; of counts the number alone."""
     assert as_well(answer, rivals) == words
+
+
+def test_encoders_that_are_called_alike_count_alike() -> None:
+    """One that went through few turns and one that went through many: what both may be."""
+    axle = """<mujoco><worldbody>{}</worldbody></mujoco>"""
+    wheel = '<body name="{0}_wheel"><joint name="{0}"/><geom size=".1"/></body>'
+    machine = Machine.of(mujoco.MjModel.from_xml_string(axle.format(wheel.format("left") + wheel.format("right"))))
+
+    def reading(column: str, joint: str, counts: tuple[int, ...]) -> Reading:
+        match = Match((column,), f"joint:{joint}.position", read_name(column, set()), 1.0)
+        scales = tuple(Scale("rev", 1 / n) for n in counts)
+        return Reading(match, "rev", factor=scales[0].factor, scales=scales)
+
+    few, many = reading("enc_left", "left", (1024, 1000, 360)), reading("enc_right", "right", (4096, 1024, 1000))
+    for one in counting_alike([few, many], machine):
+        assert (one.factor, one.scales) == (1 / 1024, (Scale("rev", 1 / 1024), Scale("rev", 1 / 1000)))
+    other = reading("motor_right", "right", (4096, 1024, 1000))
+    assert counting_alike([few, other], machine) == [few, other]

@@ -42,7 +42,7 @@ def with_pose_rates(
         if pose is not None:
             part = replace(draft, measurements=(pose, own), commands=())
             logs = loaded(part, sources, folder)
-            readings[own.match.target] = _judged(own, *_ratio(logs, _turn(model, body, site)), pose.match.column)
+            readings[own.match.target] = judged(own, *ratio_of(logs, _turn(model, body, site)), pose.match.column)
     return replace(draft, measurements=tuple(readings[r.match.target] for r in draft.measurements))
 
 
@@ -55,7 +55,7 @@ def _turn(model: mujoco.MjModel, body: int, site: int) -> FloatArray:
     return product(inverse(data.xquat[body][None]), quaternion[None])[0]
 
 
-def _ratio(logs: Sequence[Trajectory], turn: FloatArray) -> tuple[float, float]:
+def ratio_of(logs: Sequence[Trajectory], turn: FloatArray) -> tuple[float, float]:
     """How many times as fast the gyro turns as the orientation does, and the share of its variance that this explains.
 
     Of logs that measure a rotation vector and the gyro, whichever of the two is the later one.
@@ -88,7 +88,7 @@ def _rates(log: Trajectory, turn: FloatArray) -> tuple[FloatArray, FloatArray]:
     return turned(inverse(turn[None]), body), smoothed(values[:, 3:], log.dt)
 
 
-def _judged(reading: Reading, ratio: float, share: float, pose: str) -> Reading:
+def judged(reading: Reading, ratio: float, share: float, pose: str) -> Reading:
     """The gyro's reading with the unit that fits, or with a doubt."""
     if share < _EXPLAINED:
         doubt = f"it does not turn as {pose!r} does ({max(0.0, share):.0%} of its variance): how is it mounted?"
