@@ -22,7 +22,7 @@ from sipe_bayes.benchmark.cells import BASELINES, Cell
 from sipe_bayes.benchmark.executors.work import Done, Executor, Unit
 from sipe_bayes.benchmark.measure import ESTIMATES
 from sipe_bayes.benchmark.measurement import Measurement
-from sipe_bayes.benchmark.records import Record, plan
+from sipe_bayes.benchmark.records import Record, plan, posterior_path, record_path
 from sipe_bayes.benchmark.run_log import Run, read_runs, write_runs
 from sipe_bayes.benchmark.transfer.study import TransferRecord
 from sipe_bayes.core.files import OutputError, not_a_file, write_bytes
@@ -74,6 +74,7 @@ def run(cells: Sequence[Cell], order: Order, kind: AnyMeasurement | None = None)
         left = without_record(cells, order, kind)
         estimates = {e.id: e for cell in left if (e := kind.needs(cell)) is not None}
         first = without_record(list(estimates.values()), order, ESTIMATES)
+        first += [cell for cell in estimates.values() if cell not in first and _lost_draws(cell, folder)]
         plan(folder / kind.record_type.FOLDER, [cell.id for cell in cells])
         before = _failures(cells, left, folder, kind.record_type)
         text = f"{len(cells)} cells, {len(cells) - len(left)} of them there already" + f", {before} failed" * bool(
@@ -87,6 +88,11 @@ def run(cells: Sequence[Cell], order: Order, kind: AnyMeasurement | None = None)
         units = _estimate_units(left if kind is ESTIMATES else first, order)
         units += [] if kind is ESTIMATES else _units(left, first, order, kind)
         return before + _carried_out(units, order)
+
+
+def _lost_draws(cell: Cell, folder: Path) -> bool:
+    """Whether a folder has an estimate's record, and not the posterior that it came to."""
+    return Record.read(record_path(folder, cell.id)).done and not posterior_path(folder, cell.id).is_file()
 
 
 def simulate(which: Bank, budget: int, order: Order) -> int:

@@ -287,6 +287,21 @@ def test_a_failed_or_missing_estimate_is_named(tmp_path: Path) -> None:
     assert "laplace/direct/in_distribution/seed0 failed (ArithmeticError: no middle)" in line
 
 
+def test_an_estimate_whose_draws_are_not_there_is_measured_again(undisturbed: Path, tmp_path: Path) -> None:
+    """As in a copy of results that leaves the posteriors out."""
+    shutil.copytree(undisturbed, tmp_path / "out")
+    draws = posterior_path(tmp_path / "out", "Pendulum/laplace/direct/in_distribution/seed0")
+    kept = draws.read_bytes()
+    draws.unlink()
+    assert "0 estimates to make first" in measured(tmp_path / "out", *TWO).output  # nobody asks for them
+    record_path(tmp_path / "out" / "transfer", "Pendulum/laplace/transfer/in_distribution/seed0").unlink()
+    again = measured(tmp_path / "out", *TWO)
+    assert again.exit_code == 0, again.output
+    assert "1 estimates to make first" in again.output
+    assert draws.read_bytes() == kept
+    assert what_counts(tmp_path / "out") == what_counts(undisturbed)
+
+
 def test_variations_reach_the_training(tmp_path: Path) -> None:
     space = make_task("Pendulum").space
     estimated(tmp_path, Dirac([0.2, 0.3, 0.4], space))
