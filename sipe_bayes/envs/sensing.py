@@ -121,8 +121,13 @@ def sensed_channels(target: str, channels: Sequence[Channel]) -> tuple[str, list
     name, attribute = match.groups()
     sensor = re.compile(rf"^sensor:{re.escape(name)}(\[\d+\])?$")
     own = [k for k, c in enumerate(channels) if c.label == name or sensor.match(c.target)]
-    vector = {f"{name}_{axis}" for axis in "xyz"}
-    return attribute, own or [k for k, c in enumerate(channels) if c.label in vector]
+    return attribute, own or [k for k, c in enumerate(channels) if vector_of(c.label) == name]
+
+
+def vector_of(label: str) -> str:
+    """NAME of a channel that is called NAME_x or NAME[0] and so on; nothing for others."""
+    match = re.match(r"^(.+)(?:_[xyz]|\[[012]\])$", label)
+    return match.group(1) if match else ""
 
 
 def of_sensor(target: str) -> str | None:

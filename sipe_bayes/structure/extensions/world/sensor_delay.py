@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.channels import is_rotation
+from sipe_bayes.envs.sensing import vector_of
 from sipe_bayes.structure.extension import Extension, members
 from sipe_bayes.structure.machine import Machine
 
@@ -22,17 +23,19 @@ class SensorDelay(Extension):
 
     def sentence(self, site: str) -> str:
         """What it is."""
-        names = members(site)
-        return f"a delay of the measurement{'s' * (len(names) > 1)} {site if len(names) < 3 else _from_to(names)}"
+        return f"a delay of the measurement{'s' * (len(members(site)) > 1)} {_short(site)}"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
-        """Up to a tenth of a second, or twenty samples."""
+        """Up to a tenth of a second, or twenty samples; none of a part of an orientation."""
+        names = members(site)
+        if any(0 < len([name for name in names if vector_of(name) == whole]) < 3 for whole in _turning(machine)):
+            return ()
         return (
             Parameter(
-                f"{site}.delay",
+                f"{_short(site)}.delay",
                 0.0,
                 self.memory(machine.dt),
-                targets=_targets(machine, members(site)),
+                targets=_targets(machine, names),
                 description="age of the measurement",
             ),
         )
@@ -55,12 +58,19 @@ class SensorDelay(Extension):
         return tuple(f"sensor:{name}.filter" for name in members(site))
 
 
-def _from_to(names: Sequence[str]) -> str:
-    return f"{names[0]} to {names[-1]}"
+def _short(site: str) -> str:
+    """Of a site that is many the first and the last."""
+    names = members(site)
+    return site if len(names) < 3 else f"{names[0]} to {names[-1]}"
+
+
+def _turning(machine: Machine) -> set[str]:
+    """Names of the orientations that are measured."""
+    return {vector_of(channel.label) for channel in machine.environment.measurements if is_rotation(channel)}
 
 
 def _targets(machine: Machine, names: Sequence[str]) -> tuple[str, ...]:
     """Of an orientation the whole of it has a delay."""
-    turning = {channel.label for channel in machine.environment.measurements if is_rotation(channel)}
-    whole = [name.rpartition("_")[0] if name in turning else name for name in names]
+    turning = _turning(machine)
+    whole = [own if (own := vector_of(name)) in turning else name for name in names]
     return tuple(dict.fromkeys(f"sensor:{name}.delay" for name in whole))
