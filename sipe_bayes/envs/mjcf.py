@@ -277,11 +277,13 @@ class MjcfEnvironment(Environment):
     @cached_property
     def remembers(self) -> FloatArray:
         """Of sensors with an unknown delay or filter: the longest delay, three time constants of the slowest filter."""
-        out = np.zeros(len(self.channels))
+        of_logs: dict[str | None, FloatArray] = {None: np.zeros(len(self.channels))}
         for j, attribute, channels in self._sensed:
-            spans = {"delay": self.parameters[j].high, "filter": 3 * self.parameters[j].high}
-            out[channels] += spans.get(attribute, 0.0)
-        return out
+            high, log = self.parameters[j].high, self.parameters[j].log
+            spans = {"delay": high, "filter": 3 * high}
+            of_logs.setdefault(log, np.zeros(len(self.channels)))[channels] += spans.get(attribute, 0.0)
+        common = of_logs.pop(None)
+        return common + np.max([*of_logs.values(), np.zeros(len(common))], axis=0)
 
     @cached_property
     def sensed(self) -> tuple[int, ...]:  # type: ignore[override]

@@ -30,7 +30,8 @@ class CallableWindows(Windows):
         self.scales = np.arange(len(self.channels))
         count = len(trajectories)
         self.log, self.start, self.stride = np.arange(count), np.zeros(count, int), np.ones(count, int)
-        self.steps = self.stride
+        self.steps, self.lead = self.stride, np.zeros((count, len(self.channels)), int)
+        self.begin = self.lead
         self.dt, self.names, self.goals = trajectories.dt, list(trajectories.names), None
         self.owned = np.tile([False, True], (count, 1))
         self.measured = trajectories.observations[:, :, self.channels]

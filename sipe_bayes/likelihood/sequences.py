@@ -89,27 +89,42 @@ def _rates(dt: FloatArray) -> FloatArray:
     return -alike
 
 
+def _blocks(log: IntArray, start: IntArray, stride: IntArray) -> tuple[IntArray, IntArray]:
+    """First sample and the end (W,) of the windows (W,) without a gap among which each is: a log's, if all are kept."""
+    begins = np.ones(len(log), bool)
+    begins[1:] = (log[1:] != log[:-1]) | (start[1:] != start[:-1] + stride[:-1])
+    block = np.cumsum(begins) - 1
+    last = np.append(np.flatnonzero(begins)[1:], len(log)) - 1
+    return start[begins][block], (start + stride)[last][block]
+
+
 def reached(
-    remembers: FloatArray, late: FloatArray, dt: FloatArray, length: IntArray, start: IntArray
-) -> tuple[IntArray, IntArray]:
+    remembers: FloatArray, late: FloatArray, dt: FloatArray, log: IntArray, start: IntArray, stride: IntArray
+) -> tuple[IntArray, IntArray, IntArray]:
     """How many samples (W, C) after its start a window's predictions begin that tell of it alone, and where they do.
 
-    The second differs where a log begins: no window predicts what tells of the time before, an eighth of the log at
-    most.
+    And the control steps (W,) to the end of the log or block.
+
+    The second differs where a log begins, or a block of one that is kept in part: no window predicts what tells of the
+    time before, an eighth of the log or block at most.
 
     Args:
-        remembers: (C,) seconds in which a channel tells of what was before; half a log's at most.
+        remembers: (C,) seconds in which a channel tells of what was before; half a block's at most.
         late: (C,) seconds, the same of other models that are compared with this one.
         dt: (W,) seconds between samples.
-        length: (W,), control steps of the logs.
-        start: (W,), samples.
+        log: (W,), of which each window is.
+        start: (W,), its first sample.
+        stride: (W,), control steps to the beginning of the next window.
     """
+    first, past = _blocks(log, start, stride)
+    length = past - first
     lead, out = (
         np.minimum(np.ceil(x / dt[:, None] - 1e-9).astype(np.int64), length[:, None] // 2)
         for x in (remembers, np.maximum(remembers, late))
     )
-    left_out = np.minimum(out, length[:, None] // _LEFT_OUT) - start[:, None]
-    return lead, np.maximum(left_out, np.where(start[:, None], lead, 0))
+    into = (start - first)[:, None]
+    left_out = np.minimum(out, length[:, None] // _LEFT_OUT) - into
+    return lead, np.maximum(left_out, np.where(into, lead, 0)), past - start
 
 
 def owned_samples(place: IntArray, stride: IntArray, left: IntArray, known: bool) -> BoolArray:
@@ -118,7 +133,7 @@ def owned_samples(place: IntArray, stride: IntArray, left: IntArray, known: bool
     Args:
         place: (L,), in the window.
         stride: (W,), control steps to the beginning of the next window.
-        left: (W,), to the end of the log.
+        left: (W,), to the end of the log or block.
         known: whether starts are, so that the samples after them are what a window predicts.
     """
     if known:
@@ -134,7 +149,7 @@ def compared_samples(
     Args:
         place: (L,), in the window.
         stride: (W,), control steps to the beginning of the next window.
-        left: (W,), to the end of the log.
+        left: (W,), to the end of the log or block.
         begin: (W, C), the first that it predicts.
         lead: (W, C), see ``reached``.
         known: whether starts are.

@@ -119,11 +119,10 @@ class Windows:
 
     def _read_samples(self, trajectories: Trajectories, like: Windows | None) -> None:
         simulator, environment = self.simulator, self.simulator.environment
-        length, known = trajectories.length[self.log], self.settings.starts == "recorded"
+        known = self.settings.starts == "recorded"
         late = np.array([dict(self.settings.late).get(name, 0.0) for name in self.fitted])
-        reach = reached(environment.remembers[self.channels], late, self.dt, length, self.start)
+        *reach, left = reached(environment.remembers[self.channels], late, self.dt, self.log, self.start, self.stride)
         self.lead, self.begin = reach if like is None else (like.lead, like.begin)
-        left = length - self.start
         self.steps = np.minimum(self.stride + self.lead.max(1), left)
         place = np.arange(int(self.steps.max()) + 1)
         sample = self.start[:, None] + place
@@ -188,7 +187,7 @@ class Windows:
 
         Its rollouts are counted by themselves, as if whole.
         """
-        steps += int(self.lead.max())
+        steps += int(max(self.lead.max(), self.begin.max(1).min()))
         if steps >= self.steps.max():
             return self
         view = copy.copy(self)

@@ -170,13 +170,13 @@ def _search(
     _check_sites(environment, restriction.sites)
     seconds = options.physics_steps * float(simulator.model.opt.timestep)
     extensions = [get_extension(name) for name in restriction.names]
-    memory = max((extension.memory(float(trajectories.dt.max())) for extension in extensions), default=0.0)
-    late = [c for c in environment.channels if memory and (restriction.sites is None or c in restriction.sites)]
+    memory = sum(extension.memory(float(trajectories.dt.max())) for extension in extensions)
+    late = {c: float(own) + memory for c, own in zip(environment.channels, environment.remembers, strict=True)}
     fitting = Fitting(
         environment,
         trajectories,
         holdout,
-        replace(likelihood or Segments(), noise="ar1", seconds=seconds, late=tuple((c, memory) for c in late)),
+        replace(likelihood or Segments(), noise="ar1", seconds=seconds, late=tuple(late.items())),
         default_prior(environment.space) if prior is None else prior,
         whole("seed", seed, 0),
         simulator.num_threads or cores(),

@@ -21,7 +21,7 @@ from sipe_bayes.calibration.init.tables import Clock
 
 Row = dict[str, object]
 
-_FLOWN = 2.0  # against other units than SI of what thrust moves: the smaller a motion is read, the better all fits
+_FLOWN = 2.0  # against unlikely units of what thrust moves: the smaller a motion is read, the better all fits
 _UNLIKELY = 0.01  # of the logarithm of misses, by which what is not likely has to be better
 _TURNED = float(np.log(2.0))  # and a sign that a gyro speaks against, which may be mounted otherwise
 
@@ -258,7 +258,7 @@ def unit_words(reading: Reading, machine: Machine) -> tuple[str, ...]:
         return ("V", "mV")
     if kind == Kind.TORQUE or reading.unit != "1":
         return ("N m", "mN m") if hinge else ("N", "mN")
-    return ("1",) if actuator.thrust else ("1", "%")
+    return ("1", "%")
 
 
 def questions(draft: Draft, machine: Machine) -> list[Question]:
@@ -277,8 +277,7 @@ def questions(draft: Draft, machine: Machine) -> list[Question]:
             signs.append(Question((k,), (reading.sign, turned(reading.sign)), against))
     flown = any(actuator.thrust for actuator in machine.actuators)
     units = [
-        Question(tuple(members), scales, _FLOWN if flown and own == "measured" else _UNLIKELY)
-        for (own, scales), members in groups.items()
+        Question(tuple(members), scales, _FLOWN if flown else _UNLIKELY) for (_, scales), members in groups.items()
     ]
     return units + signs
 

@@ -46,7 +46,7 @@ class Actuator:
 
     That is the end of its ctrlrange, which begins at zero or as far below; None where it has no such range.
     limits: its ctrlrange, to which commands are clipped; None where it has none. tendon: whether it pulls a tendon,
-    the first of whose joints is its joint where these make it up.
+    the first of whose joints is its joint where these make it up. thrust: whether it pushes a free body at a site.
     """
 
     name: str
@@ -99,8 +99,7 @@ class Machine:
                 full_of(model, i),
                 _limits_of(model, i),
                 int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON),
-                int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_SITE)
-                and bool(model.actuator_gear[i, :3].any()),
+                _is_thrust(model, i),
             )
             for k, i in enumerate(i for i in range(model.nu) if model.actuator(i).name)
         ]
@@ -154,8 +153,14 @@ class Sizes:
 
 
 def _is_thrust(model: mujoco.MjModel, index: int) -> bool:
-    site = int(model.actuator_trntype[index]) == int(mujoco.mjtTrn.mjTRN_SITE)
-    return site and bool(model.actuator_gear[index, :3].any())
+    """Whether an actuator pushes a body that moves freely at a site of it, in no other site's axes."""
+    site, other = model.actuator_trnid[index].tolist()
+    if int(model.actuator_trntype[index]) != int(mujoco.mjtTrn.mjTRN_SITE) or other >= 0:
+        return False
+    body = int(model.body_weldid[model.site_bodyid[site]])
+    joint = int(model.body_jntadr[body])
+    free = joint >= 0 and int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE)
+    return free and bool(model.actuator_gear[index, :3].any())
 
 
 def drive_of(model: mujoco.MjModel, index: int) -> Drive:

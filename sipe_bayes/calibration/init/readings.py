@@ -25,6 +25,7 @@ _LATE = 1.0  # samples
 _ALIKE = 0.9  # share of variance from which a command is a set-point
 _UNLIKE = 0.2
 _COUNTS = (4096, 1024, 2048, 8192, 16384, 65536, 4000, 2000, 1000, 400, 10000, 20000, 131072, 360)  # to a turn
+_SIDES = {"left", "right", "l", "r"}
 _RARER = (8000, 16000, 32768, 40000, 262144)  # that simulations do not tell from the others
 _FEWEST_COUNTS = 30
 _LEAST_TURN, _MOST_TURNS = 0.01, 12.0
@@ -107,15 +108,13 @@ def _counts(values: FloatArray) -> tuple[Scale, ...]:
 
 
 def counting_alike(positions: Sequence[Reading], machine: Machine) -> list[Reading]:
-    """Positions of which columns that are called alike but for their joints count alike."""
-    owners = {
-        f"joint:{joint.name}.position": {*pieces_of(joint.name), *pieces_of(joint.body)} for joint in machine.joints
-    }
+    """Positions of which columns that are called alike but for a side, as their joints are, count alike."""
+    names = {f"joint:{joint.name}.position": joint.name for joint in machine.joints}
 
     def stem(reading: Reading) -> tuple[str, ...]:
-        return tuple(
-            p for p in pieces_of(reading.match.column) if p not in owners[reading.match.target] and not p.isdigit()
-        )
+        """Nothing without a side."""
+        pieces = pieces_of(f"{reading.match.column}_{names[reading.match.target]}")
+        return tuple(p for p in pieces if p not in _SIDES) if _SIDES.intersection(pieces) else ()
 
     left: dict[tuple[str, ...], set[Scale]] = {}
     for reading in positions:

@@ -38,7 +38,6 @@ _PRESSED = 1e-3  # of its range: the fit would have gone on
 _BEYOND = 3.0  # times a bound that the fit presses against
 _CLEAR = 15.0  # of the noise, what it has to move by itself where its share is small
 _MIXED = 0.15  # a share that is small; with more it is asked for: friction that is left out is in all others
-_SLIPPERY = 0.02  # the least friction
 
 
 def candidates(
@@ -60,7 +59,9 @@ def candidates(
     measured = {r.match.target.removeprefix("joint:").rpartition(".")[0] for r in readings if not r.commanded}
     joints = [joint for joint in machine.joints if joint.name in measured]
     driven = _driven(machine, readings)
-    gains = _shared_by_rotors([u for a, r in driven for u in (*_of_actuator(model, a, r), *_lag_of(model, a))], driven)
+    gains = _shared_by_rotors(
+        model, [u for a, r in driven for u in (*_of_actuator(model, a, r), *_lag_of(model, a))], driven
+    )
     open_scale = scale_is_open(model, machine, readings)
     behind = [int(model.joint(joint.name).bodyid[0]) for joint in joints]
     bodies = [model.body(body).id for body in machine.bodies]  # what is pushed, or carries joints
@@ -76,13 +77,15 @@ def candidates(
     return proposed or _masses(model, bodies)[0]
 
 
-def _shared_by_rotors(gains: list[Unknown], driven: Sequence[tuple[Actuator, Reading]]) -> list[Unknown]:
+def _shared_by_rotors(
+    model: mujoco.MjModel, gains: list[Unknown], driven: Sequence[tuple[Actuator, Reading]]
+) -> list[Unknown]:
     """Gains of rotors that are alike in the model as one: each by itself, they show as a centre of mass does."""
-    rotors = {f"actuator:{actuator.name}.gain" for actuator, _ in driven if actuator.thrust}
-    alike: dict[str, list[Unknown]] = {}
+    rotors = {f"actuator:{actuator.name}.gain": _thrust_at(model, actuator) for actuator, _ in driven}
+    alike: dict[tuple[int, str], list[Unknown]] = {}
     for unknown in gains:
-        if rotors.issuperset(unknown.targets):
-            alike.setdefault(unknown.note, []).append(unknown)
+        if body := rotors.get(unknown.targets[0]):
+            alike.setdefault((body, unknown.note), []).append(unknown)
     shared = [some for some in alike.values() if len(some) > 1]
     single = [unknown for unknown in gains if not any(unknown in some for some in shared)]
     every = [

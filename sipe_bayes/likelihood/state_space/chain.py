@@ -72,7 +72,7 @@ class Chain:
         self.settings, self.simulator, self.trajectories = settings, simulator, trajectories
         self.rollouts, self.uncounted, self.budget, self.short = 0, 0.0, math.inf, False
         self.channels = chosen_channels(simulator, trajectories, settings.fit)
-        check_prompt(self.fitted, simulator.environment.remembers[self.channels], float(trajectories.dt.max()))
+        check_prompt(self.fitted, simulator.environment.remembers[self.channels], float(trajectories.dt.min()))
         self.rotations = fitted_rotations(simulator.environment.rotations, self.channels)
         self.scales = noise_scales(len(self.channels), self.rotations)
         steps = trajectories.length

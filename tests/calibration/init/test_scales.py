@@ -154,7 +154,7 @@ def test_what_may_be_right_as_well_stands_in_one_line(
     assert as_well(answer, rivals) == words
 
 
-def test_encoders_that_are_called_alike_count_alike() -> None:
+def test_encoders_of_two_sides_count_alike() -> None:
     """One that went through few turns and one that went through many: what both may be."""
     axle = """<mujoco><worldbody>{}</worldbody></mujoco>"""
     wheel = '<body name="{0}_wheel"><joint name="{0}"/><geom size=".1"/></body>'
@@ -170,3 +170,6 @@ def test_encoders_that_are_called_alike_count_alike() -> None:
         assert (one.factor, one.scales) == (1 / 1024, (Scale("rev", 1 / 1024), Scale("rev", 1 / 1000)))
     other = reading("motor_right", "right", (4096, 1024, 1000))
     assert counting_alike([few, other], machine) == [few, other]
+    arm = Machine.of(mujoco.MjModel.from_xml_string(axle.format(wheel.format("shoulder") + wheel.format("elbow"))))
+    geared = [reading("enc_shoulder", "shoulder", (1024, 1000)), reading("enc_elbow", "elbow", (4096, 1000))]
+    assert counting_alike(geared, arm) == geared  # joints of an arm have gears of their own

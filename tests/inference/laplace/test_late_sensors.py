@@ -89,22 +89,43 @@ def test_every_sample_is_predicted_once(starts: str) -> None:
         assert (np.diff(windows.start[window_of] + place) == 1).all()
 
 
-def test_prompt_sensors_leave_out_as_much_where_models_are_compared() -> None:
+def samples_of(windows: Windows) -> set[tuple[int, int, int]]:
+    """Log, sample and channel of all that is compared."""
+    rows = zip(*np.nonzero(windows.observed), strict=True)
+    return {(int(windows.log[w]), int(windows.start[w] + place), int(channel)) for w, place, channel in rows}
+
+
+@pytest.mark.parametrize("seconds", [None, 4.0])
+def test_models_that_are_compared_predict_the_same_samples(seconds: float | None) -> None:
+    """Also of logs that are kept in blocks, and where a delay and a filter add up."""
     prompt = Simulator(MjcfEnvironment.build(CART, UNKNOWNS, ["push"], CHANNELS), num_threads=1)
-    log = Trajectories.stack([driven(cart(), np.full(4, 0.5), 0)[0]])
+    both = [Parameter(kind, 0.0, 0.06, targets=(f"sensor:swing.{kind}",)) for kind in ("delay", "filter")]
+    slow = Simulator(MjcfEnvironment.build(CART, [*UNKNOWNS, *both], ["push"], CHANNELS), num_threads=1)
+    logs = Trajectories.stack([driven(cart(), np.full(4, 0.5), seed)[0] for seed in (0, 1)])
     for window in (0.06, 0.5):
-        one = Windows(Segments(window, late=(("swing", 0.12),)), prompt, log)
-        other = Windows(Segments(window, late=(("swing", 0.12),)), cart(), log)
-        assert one.observed.sum() == other.observed.sum() == 2 * (STEPS + 1) - 6
+        settings = Segments(window, late=(("swing", 0.24),), seconds=seconds)
+        one, *others = (samples_of(Windows(settings, simulator, logs)) for simulator in (prompt, cart(), slow))
+        assert all(other == one for other in others)
+        assert len(one) > 150
     with pytest.raises(ValueError, match=r"late: expected names of channels with seconds not below zero"):
         Segments(late=(("swing", -0.1),))
+
+
+def test_what_begins_early_has_samples() -> None:
+    """Of whole logs of which the first eighth is left out: beginnings of windows go beyond it."""
+    prompt = Simulator(MjcfEnvironment.build(CART, UNKNOWNS, ["push"], CHANNELS), num_threads=1)
+    log = Trajectories.stack([driven(cart(), np.full(4, 0.5), 0)[0]])
+    windows = Windows(Segments(None, late=(("x", 0.3), ("swing", 0.3))), prompt, log)
+    assert windows.beginnings(4).observed.any(axis=(0, 1)).all()
 
 
 def test_windows_begin_where_a_late_sensor_will_say() -> None:
     simulator, theta = cart(), np.array([0.5, 0.5, 0.5, 0.8])
     log, truth = driven(simulator, theta, 1, noise=0.0)
-    windows = Windows(Segments(), simulator, Trajectories.stack([log]))
-    off = []
+    other = driven(simulator, theta, 2, noise=0.0)[0]
+    half = Trajectory(other.observations[:101], other.actions[:100], DT)  # neither has a name
+    both = Windows(Segments(), simulator, Trajectories.stack([half, log]))
+    windows, off = both.part(np.flatnonzero(both.log == 1)), []
     for one in (theta, np.append(theta[:-1], 0.0)):
         begin = windows.states(measured_starts(windows, one[None]))[0, :-1]
         off.append(np.abs(begin[:, 1:3] - truth[windows.start[:-1]]).max(0))

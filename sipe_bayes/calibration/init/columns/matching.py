@@ -297,7 +297,7 @@ def _by_number(machine: Machine, families: Families, labels: list[Label]) -> tup
 
     own = {actuator.name.lower() for actuator in machine.actuators}
     for stem, family in as_many.items():
-        if {x.column.lower() for x in family} == own:
+        if {x.column.lower() for x in family} == own and len(as_many) == 1:
             return stem, []
     chosen, *others = sorted(as_many, key=likeness, reverse=True)
     names = {stem: ", ".join(repr(x.column) for x in family) for stem, family in as_many.items()}

@@ -30,12 +30,14 @@ def measured_starts(windows: Windows, theta: FloatArray, near: FloatArray | None
     starts = np.tile(windows.no_starts(), (len(theta), 1, 1))
     states, tangent = simulator.environment.state_columns(model), _tangents(model)
     columns = {channel: tangent[column] for channel, column in enumerate(states) if column in tangent}
+    if are_states(simulator, windows.trajectories.states):
+        return starts
     at = simulator.space.values(np.broadcast_to(theta if near is None else near, theta.shape))
-    if not are_states(simulator, windows.trajectories.states):
-        for name in set(windows.names):
-            of_log = np.array([log == name for log in windows.names])
-            sensing = [simulator.environment.sensing(values, name) for values in at]
-            starts[:, of_log] = _earlier(windows, of_log, sensing)
+    for number in np.unique(windows.log):
+        of_log = windows.log == number
+        name = windows.names[int(np.flatnonzero(of_log)[0])]
+        sensing = [simulator.environment.sensing(values, name) for values in at]
+        starts[:, of_log] = _earlier(windows, of_log, sensing)
     for b, values in enumerate(simulator.space.values(theta)):
         for name in set(windows.names):
             one = simulator.environment.sensing(values, name)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.channels import is_rotation
-from sipe_bayes.envs.sensing import vector_of
+from sipe_bayes.envs.sensing import sensed_channels, vector_of
 from sipe_bayes.structure.extension import Extension, members
 from sipe_bayes.structure.machine import Machine
 
@@ -28,6 +28,8 @@ class SensorDelay(Extension):
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """Up to a tenth of a second, or twenty samples; none of a part of an orientation."""
         names = members(site)
+        if _late(machine).intersection(names):
+            return ()
         if any(0 < len([name for name in names if vector_of(name) == whole]) < 3 for whole in _turning(machine)):
             return ()
         return (
@@ -62,6 +64,14 @@ def _short(site: str) -> str:
     """Of a site that is many the first and the last."""
     names = members(site)
     return site if len(names) < 3 else f"{names[0]} to {names[-1]}"
+
+
+def _late(machine: Machine) -> set[str]:
+    """Channels that have an unknown delay already."""
+    channels = machine.environment.measurements
+    targets = (target for parameter in machine.environment.parameters for target in parameter.targets)
+    sensed = [one for target in targets if (one := sensed_channels(target, channels)) is not None]
+    return {channels[k].label for attribute, own in sensed if attribute == "delay" for k in own}
 
 
 def _turning(machine: Machine) -> set[str]:
