@@ -16,12 +16,14 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import replacing
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.envs.contact_targets import pair_index
+from sipe_bayes.envs.inertia import body_frame_inertia
 from sipe_bayes.envs.internal.elastic import ELASTIC, NUMBERS, motor_side
 from sipe_bayes.envs.laws.registry import LAW_OF
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import split
 
 _INERTIA_FROM_GEOMS, _INERTIA_AUTO = 1, 2  # mjtInertiaFromGeom, which Python does not have
+_PRINCIPAL = ("body_iquat", "body_inertia")
 _SIX_DIGITS = {"rtol": 1e-4, "atol": 1e-10}  # what a file of six digits may change in derived fields
 NO_NUMBERS = ("bvh", "oct", "tex", "name", "path", "_")
 """What the names of a model's fields begin with that hold none of its numbers."""
@@ -97,9 +99,18 @@ def _noted(xml: str, note: str) -> str:
 
 
 def differing_fields(a: mujoco.MjModel, b: mujoco.MjModel) -> list[str]:
-    """Names of the numeric fields in which two models differ by more than six digits explain."""
+    """Names of the numeric fields in which two models differ by more than six digits explain.
+
+    Of bodies the inertia as a whole: where two principal moments are alike, their axes may be any.
+    """
     differing = []
+    if a.nbody == b.nbody:
+        x, y = (np.stack([body_frame_inertia(model, k) for k in range(model.nbody)]) for model in (a, b))
+        if not np.allclose(x, y, _SIX_DIGITS["rtol"], 1e-5 * float(np.abs(x).max()) + _SIX_DIGITS["atol"]):
+            differing.append("the inertia of bodies")
     for name, x in number_fields(a).items():
+        if name in _PRINCIPAL and a.nbody == b.nbody:
+            continue
         y, scale = getattr(b, name), float(np.abs(x).max())
         if x.shape != y.shape or not np.allclose(x, y, _SIX_DIGITS["rtol"], 1e-5 * scale + _SIX_DIGITS["atol"]):
             differing.append(name)
