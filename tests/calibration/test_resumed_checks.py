@@ -29,12 +29,14 @@ from tests.problems.swings import call, command, environment, strict_json, swing
 
 
 def reported(calibration: Calibration) -> dict[str, object]:
-    """All that a calibration says, but how long it took."""
+    """All that a calibration says, but how long it took and in which folder its logs are."""
     drawn = {f"{s.log} {s.channel} {k}": v for s in calibration.signals for k, v in vars(s).items()}
     left = {f"{r.log} {r.channel} left {k}": v for r in calibration.residuals for k, v in vars(r).items()}
     arrays = {k: v.tobytes() for k, v in (drawn | left).items() if isinstance(v, np.ndarray)}
     further = None if calibration.further is None else calibration.further.theta.numpy().tobytes()
-    return {**calibration.to_dict(), **arrays, "further": further, "seconds": 0}
+    plain = calibration.to_dict()
+    logs = [{key: value for key, value in log.items() if key != "file"} for log in plain["logs"]]
+    return {**plain, **arrays, "logs": logs, "further": further, "seconds": 0}
 
 
 class Stopped:

@@ -71,7 +71,7 @@ def candidates(
     if open_scale and len(joints) < 2:  # a rotor is so much more mass, to which the gain is relative
         of_joints = [u for u in of_joints if not u.name.endswith("_armature")]
     flown = [body for body in bodies if body in {_thrust_at(model, a) for a, _ in driven}]
-    shapes = [unknown for body in flown for unknown in _of_flown(model, body)]
+    shapes = [unknown for body in flown if not attached for unknown in _of_flown(model, body)]
     proposed = gains + masses + shapes + of_joints + attached + _zeros(readings)
     proposed += contacts(model, {*bodies, *touching})
     return proposed or _masses(model, bodies)[0]
@@ -102,7 +102,7 @@ def _thrust_at(model: mujoco.MjModel, actuator: Actuator) -> int:
 
 
 def _of_flown(model: mujoco.MjModel, body: int) -> list[Unknown]:
-    """Inertia and centre of mass of what thrust alone turns."""
+    """Inertia and centre of mass of what thrust alone turns; what is attached to it would stand for these."""
     name, own = model.body(body).name, np.diag(body_frame_inertia(model, body))
     at, word = f"body:{name}", word_of(name)
     half = float(f"{np.sqrt(own.mean() / max(float(model.body_mass[body]), 1e-9)) / 2:.1g}")
