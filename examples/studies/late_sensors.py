@@ -198,8 +198,9 @@ def main() -> None:
                 "blocked": int(blocked.sum()),
             }
             print(name, kind, json.dumps(cell), flush=True)
+    machines = "" if given.machines == list(MACHINES) else f" --machines {' '.join(given.machines)}"
     table = {
-        "command": "python examples/studies/late_sensors.py",
+        "command": f"python examples/studies/late_sensors.py{machines}" + f" --logs {given.logs}" * (given.logs != 40),
         "source": source(),
         "versions": {p: version(p) for p in ("mujoco", "numpy", "scipy")},
         "cells": cells,

@@ -8,7 +8,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.envs.sensing import Sensing, delayed
 from sipe_bayes.inference.laplace.options import GrowingTuning
 from sipe_bayes.inference.laplace.windows.growing_windows import tells_starts, told_starts
@@ -32,18 +32,17 @@ def measured_starts(windows: Windows, theta: FloatArray, near: FloatArray | None
     columns = {channel: tangent[column] for channel, column in enumerate(states) if column in tangent}
     if are_states(simulator, windows.trajectories.states):
         return starts
-    at = simulator.space.values(np.broadcast_to(theta if near is None else near, theta.shape))
+    own_values = simulator.space.values(theta)
+    late_values = simulator.space.values(np.broadcast_to(theta if near is None else near, theta.shape))
     for number in np.unique(windows.log):
-        of_log = windows.log == number
-        name = windows.names[int(np.flatnonzero(of_log)[0])]
-        sensing = [simulator.environment.sensing(values, name) for values in at]
-        starts[:, of_log] = _earlier(windows, of_log, sensing)
-    for b, values in enumerate(simulator.space.values(theta)):
-        for name in set(windows.names):
-            one = simulator.environment.sensing(values, name)
-            mine = [w for w, log in enumerate(windows.names) if log == name]
+        mine = np.flatnonzero(windows.log == number)
+        name = windows.names[mine[0]]
+        late = [simulator.environment.sensing(values, name) for values in late_values]
+        starts[:, mine] = _earlier(windows, mine, late)
+        for b, values in enumerate(own_values):
+            sensing = simulator.environment.sensing(values, name)
             for channel, column in columns.items():
-                bias, scale, place = one.bias[channel], one.scale[channel], states[channel]
+                bias, scale, place = sensing.bias[channel], sensing.scale[channel], states[channel]
                 if scale != 1.0 and scale:
                     reference = windows.reference[mine, place]
                     measured = reference + starts[b, mine, column]
@@ -53,9 +52,9 @@ def measured_starts(windows: Windows, theta: FloatArray, near: FloatArray | None
     return starts
 
 
-def _earlier(windows: Windows, own: BoolArray, sensing: Sequence[Sensing]) -> FloatArray:
-    """Starts (B, w, D) of one log's windows (W,), as B sensings say how late its samples are."""
-    log, simulator = windows.trajectories[int(windows.log[own][0])], windows.simulator
+def _earlier(windows: Windows, own: IntArray, sensing: Sequence[Sensing]) -> FloatArray:
+    """Starts (B, w, D) of one log's windows (w,), as B sensings say how late its samples are."""
+    log, simulator = windows.trajectories[int(windows.log[own[0]])], windows.simulator
     out: dict[bytes, FloatArray] = {}
     for one in sensing:
         late = one.delay + one.filter
