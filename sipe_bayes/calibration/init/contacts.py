@@ -74,13 +74,17 @@ def _of_geoms(
     span: tuple[float, float],
     what: str,
 ) -> list[Unknown]:
-    """One number of geoms that move and of those that stand still; nothing where all of one sort have no name."""
-    named = [[model.geom(g).name for g in part if model.geom(g).name] for part in geoms]
-    if any(part and not names for part, names in zip(geoms, named, strict=True)):
+    """One number of geoms that move and of those that stand still; nothing where all of one sort have no name.
+
+    That of the largest friction is first: what the model has of the parameter is what its first target has.
+    """
+    named = [[g for g in part if model.geom(g).name] for part in geoms]
+    if any(part and not with_name for part, with_name in zip(geoms, named, strict=True)):
         return []
     missing = sum(map(len, geoms)) - sum(map(len, named))
     what += f"; {missing} geoms are left out that have no name" if missing else ""
-    return [Unknown(name, tuple(f"geom:{n}.{field}" for part in named for n in part), *span, False, what)]
+    ordered = sorted((g for part in named for g in part), key=lambda g: -own_friction(model, g))
+    return [Unknown(name, tuple(f"geom:{model.geom(g).name}.{field}" for g in ordered), *span, False, what)]
 
 
 def _mixed(own: Sequence[int], still: Sequence[int], least: float) -> str:

@@ -128,18 +128,21 @@ def _descended(
 ) -> tuple[dict[int, _Point], _Slopes, int]:
     """The best point of each delay that was followed to the end, the last slopes, and the best delay, where they are.
 
-    It ends where all of them have come to rest: a delay that has not loses against one that has.
+    It ends where all of them have come to rest: a delay that has not loses against one that has. Slopes are those of the
+    best delay's best point where that was linearised: a step that went too far may have left nothing to be told apart.
     """
-    points, tentative = dict(begun), dict(begun)
+    points, tentative, by_delay = dict(begun), dict(begun), dict[int, _Slopes]()
     widest, last = max(points), dict.fromkeys(points, np.inf)
     for turn in range(rounds):
-        slopes = _slopes(trial, assumption, tentative, best)
+        slopes, linearised = _slopes(trial, assumption, tentative, best), best
         for (d, point), cost in zip(list(tentative.items()), _costs(slopes, trial), strict=True):
             known = points.get(d, point)
             if cost > known.cost:  # the last step went too far
                 tentative[d] = _Point(0.5 * (known.theta + point.theta), 0.5 * (known.starts + point.starts))
             else:
                 points[d] = replace(point, cost=cost)
+        if tentative[linearised].theta is points[linearised].theta:
+            by_delay[linearised] = slopes
         best = min(tentative, key=lambda d: points[d].cost)
         still = any(tentative[d].theta is not points[d].theta for d in tentative)
         if turn == rounds - 1 or not (
@@ -151,7 +154,7 @@ def _descended(
         if turn:
             near = [d for d in range(best - 2, best + 3) if 0 <= d <= widest]
             tentative = {d: tentative.get(d, tentative[best]) for d in sorted({0, *near})}
-    return {d: points[d] for d in sorted(tentative) if d in points}, slopes, best
+    return {d: points[d] for d in sorted(tentative) if d in points}, by_delay.get(best, slopes), best
 
 
 def _slopes(trial: Trial, assumption: Assumption, points: dict[int, _Point], best: int) -> _Slopes:

@@ -11,6 +11,7 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 
 _GRAVITY, _BRISK = 9.81, 10.0  # m/s^2, rad/s^2 or m/s^2: motions of unknown machines
+_NO_MASS = 0.01  # of all that a body carries
 
 
 class Drive(Enum):
@@ -32,12 +33,16 @@ _INPUTS = {
 
 @dataclass(frozen=True)
 class Joint:
-    """A hinge or slide and its body; rank: its place among these."""
+    """A hinge or slide and its body; rank: its place among these; base: whether it only says where an undriven base is.
+
+    Such a joint has no bearing and no gears: see ``base_joints``.
+    """
 
     name: str
     body: str
     hinge: bool
     rank: int
+    base: bool = False
 
 
 @dataclass(frozen=True)
@@ -83,9 +88,14 @@ class Machine:
         """Read a compiled model."""
         scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
         named = [i for i in range(model.njnt) if int(model.jnt_type[i]) in scalar and model.joint(i).name]
+        of_base = base_joints(model)
         joints = [
             Joint(
-                model.joint(i).name, model.body(int(model.jnt_bodyid[i])).name, int(model.jnt_type[i]) == scalar[0], k
+                model.joint(i).name,
+                model.body(int(model.jnt_bodyid[i])).name,
+                int(model.jnt_type[i]) == scalar[0],
+                k,
+                i in of_base,
             )
             for k, i in enumerate(named)
         ]
@@ -150,6 +160,58 @@ class Sizes:
             return {name: max(float(values[i]), least) for name, i in at.items()}
 
         return cls(by_name(force, 1e-9), by_name(speed, 1e-3), by_name(inertia, 1e-12))
+
+
+def base_joints(model: mujoco.MjModel) -> dict[int, int]:
+    """Slides and hinges that stand for a planar or free base, each with the id of the base's body.
+
+    These are the joints between the world and the first body with a mass, two slides at least, of which nothing drives,
+    sprung or rubs in the model, where actuators move joints of what it carries.
+    """
+    driven = {_joint_of(model, i) for i in range(model.nu)}
+    out: dict[int, int] = {}
+    for body in range(1, model.nbody):
+        above = _above(model, body)
+        if any(_has_mass(model, b) for b in above) or not _has_mass(model, body):
+            continue
+        joints = [j for j in range(model.njnt) if int(model.jnt_bodyid[j]) in (body, *above)]
+        slides = sum(int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_SLIDE) for j in joints)
+        held = any(j in driven or _resists(model, j) for j in joints)
+        if slides >= 2 and not held and _carries_motors(model, body):
+            out |= dict.fromkeys(joints, body)
+    return out
+
+
+def bases(model: mujoco.MjModel) -> set[int]:
+    """Ids of the bodies that nothing holds and that carry what actuators move: of rovers, walkers, drones with arms."""
+    free = [j for j in range(model.njnt) if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE)]
+    loose = {int(model.jnt_bodyid[j]) for j in free}
+    return {body for body in loose if _carries_motors(model, body)} | set(base_joints(model).values())
+
+
+def _carries_motors(model: mujoco.MjModel, body: int) -> bool:
+    moved = (_joint_of(model, i) for i in range(model.nu))
+    return any(body in _above(model, int(model.jnt_bodyid[j])) for j in moved if j >= 0)
+
+
+def _above(model: mujoco.MjModel, body: int) -> list[int]:
+    """The bodies that carry a body, without the world."""
+    out, parent = list[int](), int(model.body_parentid[body])
+    while parent:
+        out.append(parent)
+        parent = int(model.body_parentid[parent])
+    return out
+
+
+def _has_mass(model: mujoco.MjModel, body: int) -> bool:
+    """Whether it weighs more than what bodies get that only hold joints apart."""
+    return float(model.body_mass[body]) > _NO_MASS * float(model.body_subtreemass[body])
+
+
+def _resists(model: mujoco.MjModel, joint: int) -> bool:
+    dof = int(model.jnt_dofadr[joint])
+    fields = (model.dof_damping, model.dof_frictionloss, model.dof_armature)
+    return bool(model.jnt_stiffness[joint]) or any(bool(field[dof]) for field in fields)
 
 
 def _is_thrust(model: mujoco.MjModel, index: int) -> bool:

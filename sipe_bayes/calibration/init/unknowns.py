@@ -18,6 +18,7 @@ from sipe_bayes.calibration.init.machine import (
     Joint,
     Machine,
     Sizes,
+    bases,
 )
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
@@ -67,13 +68,15 @@ def candidates(
     bodies = [model.body(body).id for body in machine.bodies]  # what is pushed, or carries joints
     free = bodies if driven else []  # what is only thrown moves alike whatever its mass
     masses, attached = _masses(model, [*behind, *free])
-    of_joints = [u for joint in joints for u in _of_joint(model, joint, sizes)]
+    of_joints = [u for joint in joints if not joint.base for u in _of_joint(model, joint, sizes)]
     if open_scale and len(joints) < 2:  # a rotor is so much more mass, to which the gain is relative
         of_joints = [u for u in of_joints if not u.name.endswith("_armature")]
     flown = [body for body in bodies if body in {_thrust_at(model, a) for a, _ in driven}]
-    shapes = [unknown for body in flown if not attached for unknown in _of_flown(model, body)]
+    shapes = [unknown for body in flown if not attached for unknown in _of_base(model, body)]
     proposed = gains + masses + shapes + of_joints + attached + _zeros(readings)
     proposed += contacts(model, {*bodies, *touching})
+    carrying = bases(model) - {*flown} if driven and not attached else ()
+    proposed += [unknown for body in carrying for unknown in _of_base(model, body)]
     return proposed or _masses(model, bodies)[0]
 
 
@@ -101,8 +104,8 @@ def _thrust_at(model: mujoco.MjModel, actuator: Actuator) -> int:
     return int(model.body_weldid[model.site_bodyid[site]]) if actuator.thrust else 0
 
 
-def _of_flown(model: mujoco.MjModel, body: int) -> list[Unknown]:
-    """Inertia and centre of mass of what thrust alone turns; what is attached to it would stand for these."""
+def _of_base(model: mujoco.MjModel, body: int) -> list[Unknown]:
+    """Inertia and centre of mass of what nothing holds; what is attached to it would stand for these."""
     name, own = model.body(body).name, np.diag(body_frame_inertia(model, body))
     at, word = f"body:{name}", word_of(name)
     half = float(f"{np.sqrt(own.mean() / max(float(model.body_mass[body]), 1e-9)) / 2:.1g}")
@@ -132,7 +135,7 @@ def _zeros(readings: Sequence[Reading]) -> list[Unknown]:
 def springs(model: mujoco.MjModel, machine: Machine, readings: Sequence[Reading], sizes: Sizes) -> list[Unknown]:
     """Springs that the model lacks at measured joints: not asked for, but left out of a fit they look like delays."""
     measured = {r.match.target for r in readings if not r.commanded}
-    joints = [j for j in machine.joints if f"joint:{j.name}.position" in measured]
+    joints = [j for j in machine.joints if f"joint:{j.name}.position" in measured and not j.base]
     soft = [j for j in joints if not float(np.ravel(model.joint(j.name).stiffness)[0])]
     return [
         Unknown(
