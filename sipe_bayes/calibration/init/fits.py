@@ -128,8 +128,8 @@ def _descended(
 ) -> tuple[dict[int, _Point], _Slopes, int]:
     """The best point of each delay that was followed to the end, the last slopes, and the best delay, where they are.
 
-    It ends where all of them have come to rest: a delay that has not loses against one that has. Slopes are those of the
-    best delay's best point where that was linearised: a step that went too far may have left nothing to be told apart.
+    It ends where all of them have come to rest: a delay that has not loses against one that has. Slopes are those of
+    the best point where it was linearised: a last step that went too far may have left nothing to be told apart.
     """
     points, tentative, by_delay = dict(begun), dict(begun), dict[int, _Slopes]()
     widest, last = max(points), dict.fromkeys(points, np.inf)

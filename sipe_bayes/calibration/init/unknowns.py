@@ -114,10 +114,14 @@ def _of_base(model: mujoco.MjModel, body: int) -> list[Unknown]:
         for x, value in zip("xyz", own, strict=True)
     ]
     centre = [
-        Unknown(f"{word}_com_{x}", (f"{at}.com_{x}",), value - half, value + half, False, "centre of mass")
+        Unknown(f"{word}_com_{x}", (f"{at}.com_{x}",), *_around(value, half), False, "centre of mass")
         for x, value in zip("xyz", np.round(model.body_ipos[body], 4).tolist(), strict=True)
     ]
     return [*inertia, *centre]
+
+
+def _around(value: float, half: float) -> tuple[float, float]:
+    return float(f"{value - half:.4g}"), float(f"{value + half:.4g}")
 
 
 def _zeros(readings: Sequence[Reading]) -> list[Unknown]:

@@ -12,6 +12,7 @@ from sipe_bayes.calibration.init.machine import Machine
 from sipe_bayes.calibration.init.unknowns import as_parameters
 from sipe_bayes.calibration.init.windows import rough_unknowns
 from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.envs.targets import bind
 
 
 def asked(bodies: str, floor: str = "") -> dict[str, Unknown]:
@@ -104,9 +105,11 @@ def test_what_is_said_of_a_friction_is_what_mujoco_does() -> None:
 
 
 @pytest.mark.parametrize("floor", ["", 'priority="1"', 'friction=".3"'])
-@pytest.mark.parametrize("tyre", ["", 'friction=".6"', 'friction="1.2"', 'priority="1" friction=".2"'])
+@pytest.mark.parametrize(
+    "tyre", ["", 'friction=".01"', 'friction=".6"', 'friction="1.2"', 'priority="1" friction=".2"']
+)
 def test_each_friction_is_the_contacts(tyre: str, floor: str) -> None:
-    """Half-way up its bounds, every contact of a group has that friction in MuJoCo."""
+    """Half-way up its bounds, every contact of a group has that friction in MuJoCo; so has what the model says."""
     text = (
         f'<mujoco><worldbody><geom name="floor" type="plane" size="3 3 .1" {floor}/>{rover(tyre)}</worldbody></mujoco>'
     )
@@ -115,19 +118,20 @@ def test_each_friction_is_the_contacts(tyre: str, floor: str) -> None:
             continue
         model = mujoco.MjModel.from_xml_string(text)
         value, geoms = 0.5 * (unknown.low + unknown.high), [t.split(":")[1].split(".")[0] for t in unknown.targets]
-        for one in geoms:
-            model.geom(one).friction[0] = value
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
-        pairs = {frozenset(int(g) for g in c.geom): c.friction[0] for c in data.contact}
-        floor_id = model.geom("floor").id
-        seen = [
-            mu
-            for pair, mu in pairs.items()
-            if floor_id in pair and pair & {model.geom(g).id for g in {*geoms} - {"floor"}}
-        ]
-        assert seen or geoms == ["floor"]
-        np.testing.assert_allclose(seen, value)
+        for friction in (bind(model, unknown.targets[0]).value, value):
+            for one in geoms if friction == value else ():
+                model.geom(one).friction[0] = value
+            data = mujoco.MjData(model)
+            mujoco.mj_forward(model, data)
+            pairs = {frozenset(int(g) for g in c.geom): c.friction[0] for c in data.contact}
+            floor_id = model.geom("floor").id
+            seen = [
+                mu
+                for pair, mu in pairs.items()
+                if floor_id in pair and pair & {model.geom(g).id for g in {*geoms} - {"floor"}}
+            ]
+            assert seen or geoms == ["floor"]
+            np.testing.assert_allclose(seen, friction)
 
 
 def test_bounds_hold_the_friction_that_the_model_has() -> None:
