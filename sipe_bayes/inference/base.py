@@ -228,12 +228,16 @@ class Estimator(ABC, Generic[S]):
             while not last.state.done:
                 last = self._keep(self.step(last.state, batch))
                 stored.offer(last, last.state.done, self._bound is not None and self._bound[1].short)
-                if self.progress is not None:
-                    self.progress(self.describe(last.state), self.rollouts, self.budget)
+                self.tell(self.describe(last.state), self.rollouts)
         except BudgetExhausted:
             stored.write()
             self.find(Code.BUDGET_SPENT, budget=self.budget)
         return self._finished(last.state, batch)
+
+    def tell(self, what: str, rollouts: int) -> None:
+        """Progress, where it is wanted."""
+        if self.progress is not None:
+            self.progress(what, rollouts, self.budget)
 
     def budget_for(self, trajectories: Trajectories) -> int:
         """Where the user names none."""
@@ -259,9 +263,7 @@ class Estimator(ABC, Generic[S]):
     def get_parameter_estimate(self, trajectories: Recorded) -> Posterior:
         """The posterior of the present state."""
         if self._last is None:
-            raise ValueError(
-                "get_parameter_estimate: nothing has been fitted yet; call update_parameter_estimate first"
-            )
+            raise ValueError("get_parameter_estimate: nothing is fitted yet; call update_parameter_estimate first")
         self.go_on_from(self._last)
         return self._finished(self._last.state, self._given.stack(self._recorded(trajectories)))
 

@@ -287,7 +287,7 @@ def test_the_papers_loop(name: str) -> None:
     simulator = pendulum()
     trajectory = log(simulator, TRUTH, 1, steps=100)
     estimator = get_estimator(simulator, name, **quick(name))
-    with pytest.raises(ValueError, match="nothing has been fitted"):
+    with pytest.raises(ValueError, match="nothing is fitted"):
         estimator.get_parameter_estimate(trajectory)
     for _ in range(40):
         estimator.update_parameter_estimate(trajectory)

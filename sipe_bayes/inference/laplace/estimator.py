@@ -114,7 +114,7 @@ class Laplace(Estimator[LaplaceState]):
     @property
     def problem(self) -> SearchProblem:
         """What its search is given."""
-        return SearchProblem(self.space, self.prior, self.seed, self.options, self.findings.add)
+        return SearchProblem(self.space, self.prior, self.seed, self.options, self.findings.add, self.tell)
 
     def start(self, trajectories: Trajectories) -> LaplaceState:
         """The first state of the search that fits the likelihood."""
@@ -191,13 +191,13 @@ class Laplace(Estimator[LaplaceState]):
             stands = not state.judgements or state.judgements[0].normal
             return self._looked_beyond(windows, state, target) if stands or not shots_left else state
         assert isinstance(state.search, WindowState)
-        if (elsewhere := led_on(self.problem, windows, state.search)) is not None:
-            return replace(state, search=elsewhere)
-        kept = distinct(state.search.optima)
+        if not (search := led_on(self.problem, windows, state.search)).done:
+            return replace(state, search=search)
+        kept = distinct(search.optima)
         probe = probed(self.problem, windows, kept)
         if probe.stands:
-            return replace(ended, search=_looked_around(state.search, kept[0]))
-        state = replace(ended, draws=probe.draws, given=probe.given, unjudged=not probe.judged)
+            return replace(ended, search=_looked_around(search, kept[0]))
+        state = replace(ended, search=search, draws=probe.draws, given=probe.given, unjudged=not probe.judged)
         return replace(state, done=probe.draws is None or not windows.has_room(draw_size(self.problem, windows, kept)))
 
     def _shots_left(self, search: WindowState | StateSpaceState | KnownStartState) -> bool:

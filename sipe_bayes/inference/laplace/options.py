@@ -120,6 +120,7 @@ class LongerTuning(Options):
     share: float = option(
         0.6, "of the budget that is left, for their search: the rest goes on from there", above=0, below=1
     )
+    most: float = option(2.0, "times what the search has cost, for theirs: the model may be what is wrong", above=0)
     better: float = option(0.5, "residuals from which the search goes on there", "of those before", above=0, below=1)
 
 

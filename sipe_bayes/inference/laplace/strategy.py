@@ -90,6 +90,7 @@ class SearchProblem:
         seed: of whatever is drawn.
         options: of ``laplace``.
         find: notes a finding.
+        tell: called within a long step with what is being done, and the rollouts so far.
     """
 
     space: ParameterSpace
@@ -97,6 +98,7 @@ class SearchProblem:
     seed: int
     options: LaplaceOptions
     find: Callable[[Finding], None]
+    tell: Callable[[str, int], None] = lambda what, rollouts: None
 
     def within(self, initial: FloatArray) -> Self:
         """The same problem from other starting points (R, N), a part of a search that notes no findings."""

@@ -22,6 +22,7 @@ Of each starting point the likeliest optimum is kept: its normal in theta, with 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -158,7 +159,9 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         """Theta and states where long windows without process noise end; None where ``budget`` is too small."""
         chain = self.chain
         settings = Segments(noise="white", fit=chain.settings.fit, noise_sd=chain.settings.noise_sd)
-        trail, rollouts = trailed(self.problem, chain.simulator, chain.trajectories, settings, budget)
+        before = math.ceil(chain.rollouts)
+        counted = replace(self.problem, tell=lambda what, more: self.problem.tell(what, before + more))
+        trail, rollouts = trailed(counted, chain.simulator, chain.trajectories, settings, budget)
         chain.rollouts += rollouts
         if trail is None:
             return None

@@ -42,28 +42,30 @@ class Trail:
     states: Sequence[FloatArray]
 
 
-def led_on(problem: SearchProblem, windows: Windows, state: WindowState) -> WindowState | None:
-    """A finished search on from where longer windows lead; None where it is not lost, or they are no better."""
+def led_on(problem: SearchProblem, windows: Windows, state: WindowState) -> WindowState:
+    """A finished search on from where longer windows lead; as it is where it is not lost, or they are no better."""
     tuning, settings = problem.options.tuning.longer, windows.settings
     asked = bool(state.optima) and not state.longer and settings.window is not None
     if not asked or not windows.num_start or windows.starts_measured:
-        return None
+        return state
     best = max(state.optima, key=lambda one: one.evidence)
     if not (best.sd > tuning.lost * level(windows).sd).any():
-        return None
-    budget = tuning.share * (windows.budget - windows.rollouts)
-    trail, rollouts = trailed(problem, windows.simulator, windows.trajectories, settings, budget)
+        return state
+    tried, before = replace(state, longer=True), windows.rollouts
+    budget = min(tuning.share * (windows.budget - before), tuning.most * before)
+    counted = replace(problem, tell=lambda what, more: problem.tell(what, math.ceil(before) + more))
+    trail, rollouts = trailed(counted, windows.simulator, windows.trajectories, settings, budget)
     windows.rollouts += rollouts
     if trail is None:
-        return None
+        return tried
     begins = np.stack([trail.states[k][s] for k, s in zip(windows.log, windows.start, strict=True)])
     starts = tangents(windows.simulator.model, begins, windows.reference)
     residual, valid = windows.residuals(trail.theta[None], starts[None])
     left = np.sqrt((residual[0] ** 2).sum((0, 1)) / np.maximum(windows.observed.sum((0, 1)), 1))
     if not valid[0] or not np.log(left / best.sd).mean() < np.log(tuning.better):
-        return None
-    fresh = replace(state, optima=(), wild=np.zeros((0, 3), np.int64), longer=True)
-    return WindowSearch(problem, windows).onward(fresh, trail.theta, starts)
+        return tried
+    fresh = replace(tried, optima=(), wild=np.zeros((0, 3), np.int64))
+    return WindowSearch(problem, windows).onward(fresh, trail.theta, starts) or tried
 
 
 def trailed(
@@ -85,6 +87,7 @@ def trailed(
         while not state.done:
             state = search.step(state)
             optima = state.optima
+            problem.tell(f"windows {tuning.times} times as long, {state.describe()}", math.ceil(windows.rollouts))
     except BudgetExhausted:
         pass  # what was recorded may do
     spent = math.ceil(windows.rollouts)
