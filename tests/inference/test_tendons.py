@@ -10,16 +10,8 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.registry import get_estimator
 from sipe_bayes.simulation.simulator import Simulator
+from tests.problems.tendons import FINGER
 
-FINGER = """<mujoco><compiler angle="radian"/><option timestep="0.005" integrator="implicitfast"/><worldbody>
-  <site name="anchor" pos="-.03 0 -.012"/><body><joint name="mcp" axis="0 1 0" stiffness=".04" damping=".002"/>
-  <geom type="capsule" fromto="0 0 0 .05 0 0" size=".008" mass=".04"/><site name="a" pos=".01 0 -.01"/>
-  <site name="b" pos=".04 0 -.01"/><body pos=".05 0 0"><joint name="pip" axis="0 1 0" stiffness=".03" damping=".001"/>
-  <geom type="capsule" fromto="0 0 0 .04 0 0" size=".007" mass=".025"/><site name="c" pos=".012 0 -.01"/></body></body>
-  </worldbody><tendon><spatial name="flexor" stiffness="20" damping="4" frictionloss=".3">
-  <site site="anchor"/><site site="a"/><site site="b"/><site site="c"/></spatial></tendon>
-  <actuator><motor name="drive" tendon="flexor" gear="-3"/></actuator>
-  <sensor><tendonpos name="length" tendon="flexor"/><tendonvel name="speed" tendon="flexor"/></sensor></mujoco>"""
 BELT = """<mujoco><compiler angle="radian"/><option timestep="0.005" integrator="implicitfast"/><worldbody>
   <body><joint name="one" axis="0 1 0" damping=".02"/><geom type="capsule" fromto="0 0 0 0 0 -.2" size=".02" mass=".3"/>
   </body><body pos=".5 0 0"><joint name="two" axis="0 1 0" damping=".02"/>

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.envs.kinds.tendons import tendon_arms
 
 _GRAVITY, _BRISK = 9.81, 10.0  # m/s^2, rad/s^2 or m/s^2: motions of unknown machines
 
@@ -142,7 +143,7 @@ class Sizes:
             speed = np.abs(data.qvel.copy())
             moving = _BRISK * inertia if states is None else np.zeros(model.nv)
             gravity = np.abs(data.qfrc_bias) + (0.5 * _GRAVITY * np.sqrt(inertia) if states is None else 0.0)
-            arms = _tendon_arms(model, data)
+            arms = tendon_arms(model, data)
             carried = _carried(full, arms)
             pulls = _pulls(model, data) + (_BRISK * carried if states is None else 0.0)
             forces.append([*(np.abs(data.qfrc_actuator) + gravity + moving), *pulls])
@@ -161,14 +162,6 @@ class Sizes:
             return {name: max(float(values[i]), least) for name, i in at.items()}
 
         return cls(by_name(force, 1e-9), by_name(speed, 1e-3), by_name(inertia, 1e-12))
-
-
-def _tendon_arms(model: mujoco.MjModel, data: mujoco.MjData) -> FloatArray:
-    """How far each joint moves each tendon (ntendon, nv)."""
-    arms = np.zeros((model.ntendon, model.nv))
-    for row, first, count in zip(arms, model.ten_J_rowadr, model.ten_J_rownnz, strict=True):
-        row[model.ten_J_colind[first : first + count]] = data.ten_J.ravel()[first : first + count]
-    return arms
 
 
 def _carried(inertia: FloatArray, arms: FloatArray) -> FloatArray:

@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.envs.target import Maker, Target, TargetError, entry
 
@@ -139,6 +140,14 @@ def _fixed(model: mujoco.MjModel) -> Iterator[tuple[str, str, int]]:
         if model.tendon(tendon).name and int(model.wrap_type[wraps.start]) == _BY_JOINT:
             for wrap in range(wraps.start, wraps.stop):
                 yield model.tendon(tendon).name, model.joint(int(model.wrap_objid[wrap])).name, wrap
+
+
+def tendon_arms(model: mujoco.MjModel, data: mujoco.MjData) -> FloatArray:
+    """How far each degree of freedom moves each tendon (ntendon, nv), at positions that MuJoCo has gone through."""
+    arms = np.zeros((model.ntendon, model.nv))
+    for row, first, count in zip(arms, model.ten_J_rowadr, model.ten_J_rownnz, strict=True):
+        row[model.ten_J_colind[first : first + count]] = data.ten_J.ravel()[first : first + count]
+    return arms
 
 
 def copy_tendon(spec: mujoco.MjSpec, model: mujoco.MjModel, target: str) -> None:
