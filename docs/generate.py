@@ -135,7 +135,8 @@ def targets() -> str:
     ]
     return f"""# Targets
 
-What a parameter may change in the model. NAME is the name in the MJCF; a body's, joint's or actuator's must have one.
+What a parameter may change in the model. NAME is the name in the MJCF, which a body, joint, tendon or actuator must
+have.
 
 {table(("target", "what it is"), rows)}
 A mass scales its inertia. Inertias that no rigid body has (A + B < C) are left out. `identified.xml` has no place for
@@ -143,6 +144,11 @@ what a sensor does, which is named instead.
 
 Two geoms that touch share one contact: friction is the larger of theirs, `solref` and `solimp` are between theirs, so
 name both as `targets`, or list the pair in the MJCF and name that.
+
+What acts along a *tendon* is in N and m; in N m and rad where the coefficients of its hinges are 1 or -1; else in the
+unit in which the coefficients are, which MJCF does not tell: for a radius of 12 mm, 0.012, in N and m again. Its length
+is measured as a `tendonpos` sensor of the MJCF and its velocity as a `tendonvel`, as `sensor:NAME`, also where no joint
+is: a winch's encoder. Where the sites of a spatial tendon lie is no target.
 
 A *law* is a force that MJCF has no element for. Its numbers stand in the model as a custom numeric such as
 `joint:elbow.load_friction`, also in `identified.xml`, and sipe_bayes writes the force before every physics step;

@@ -139,7 +139,7 @@ class Measurement(Table):
     target: TargetWord
     """`"joint:NAME.position"`, `"joint:NAME.velocity"`, `"joint:NAME.force"` (what actuators apply there, such as the
     effort of a servo), `"body:NAME.position"`, `.orientation`, `.linear_velocity`, `.angular_velocity` (of a body's
-    frame in the world's axes), `"sensor:NAME"` or `"sensor:NAME[0]"`"""
+    frame in the world's axes), `"sensor:NAME"` or `"sensor:NAME[0]"` of the MJCF, as of a `tendonpos`"""
     unit: UnitWord
     """unit of that column; its kind is checked against the model"""
     sign: Sign = 1

@@ -11,6 +11,8 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.rotations import rotation_vectors
+from sipe_bayes.core.units import UNITS
+from sipe_bayes.envs.kinds.tendons import tendon_unit
 from sipe_bayes.envs.target import TargetError, named
 
 _AXES = ("x", "y", "z")
@@ -48,6 +50,11 @@ _SENSOR_UNITS = {
     "N m": (mujoco.mjtSensor.mjSENS_TORQUE, mujoco.mjtSensor.mjSENS_JOINTACTFRC),
 }
 _OF_JOINTS = (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL, mujoco.mjtSensor.mjSENS_JOINTACTFRC)
+_OF_TENDONS = {
+    mujoco.mjtSensor.mjSENS_TENDONPOS: "length",
+    mujoco.mjtSensor.mjSENS_TENDONVEL: "velocity",
+    mujoco.mjtSensor.mjSENS_TENDONACTFRC: "force",
+}
 
 
 @dataclass(frozen=True)
@@ -232,6 +239,9 @@ def state_column(model: mujoco.MjModel, reader: Reader) -> int | None:
 
 def _sensor_unit(model: mujoco.MjModel, sensor: int) -> str:
     kind, joint = mujoco.mjtSensor(int(model.sensor_type[sensor])), int(model.sensor_objid[sensor])
+    if kind in _OF_TENDONS:
+        known = tendon_unit(model, joint, _OF_TENDONS[kind])
+        return known if known in UNITS else ""
     unit = next((unit for unit, kinds in _SENSOR_UNITS.items() if kind in kinds), "")
     if kind in _OF_JOINTS and int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE):
         return {"rad": "m", "rad/s": "m/s", "N m": "N"}[unit]

@@ -15,9 +15,10 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import replacing
 from sipe_bayes.core.findings import Code, Finding, finding
-from sipe_bayes.envs.contact_targets import pair_index
 from sipe_bayes.envs.inertia import body_frame_inertia
 from sipe_bayes.envs.internal.elastic import ELASTIC, NUMBERS, motor_side
+from sipe_bayes.envs.kinds.contacts import pair_index
+from sipe_bayes.envs.kinds.tendons import copy_tendon, with_coefficients
 from sipe_bayes.envs.laws.registry import LAW_OF
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import split
@@ -83,7 +84,7 @@ def _write(spec: mujoco.MjSpec, model: mujoco.MjModel, path: Path, note: str) ->
     with replacing(path) as temporary:
         try:
             spec.compile()
-            temporary.write_text(_noted(spec.to_xml(), note), encoding="utf-8")
+            temporary.write_text(_noted(with_coefficients(spec.to_xml(), model), note), encoding="utf-8")
             written = mujoco.MjModel.from_xml_path(str(temporary))
         except ValueError as error:  # six digits can break A + B >= C of a flat body
             reason = " ".join(str(error).split())
@@ -143,6 +144,8 @@ def _copy(spec: mujoco.MjSpec, model: mujoco.MjModel, target: str) -> None:
         _copy_elastic(spec, model, name)
     elif kind == "joint":
         _copy_joint(spec, model, name, attribute)
+    elif kind == "tendon":
+        copy_tendon(spec, model, target)
     elif kind == "actuator":
         _copy_actuator(spec, model, name)
     elif kind == "geom":
@@ -196,6 +199,8 @@ def _copy_joint(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str, attribute
         value = float(model.qpos_spring[int(model.jnt_qposadr[index])])
         hinge = int(model.jnt_type[index]) == int(mujoco.mjtJoint.mjJNT_HINGE)
         joint.springref = np.degrees(value) if hinge and spec.compiler.degree else value
+        for tendon, lengths in zip(spec.tendons, model.tendon_lengthspring, strict=True):
+            tendon.springlength[:] = lengths  # without one of its own it would rest where the joint's spring does
     elif attribute == "armature" and motor_side(model, name) >= 0:
         spec.tendon(model.tendon(motor_side(model, name)).name).armature = model.tendon_armature[
             motor_side(model, name)

@@ -372,6 +372,9 @@ def _prepared(
             kind, name, attribute = split(target, parameter.name)
             if kind == "body" and attribute != "mass" and spec.body(name) is not None:
                 spec.body(name).simple = False
+            if attribute == "armature" and spec.tendons:  # a tendon's inertia couples what it moves
+                for body in spec.bodies[1:]:
+                    body.simple = False
             if kind == "actuator" and attribute == "delay" and spec.actuator(name) is not None:
                 actuator = spec.actuator(name)
                 # the physics step may be refined to half the model's own

@@ -36,8 +36,12 @@ _REACH = 4.0  # sds: what a normal is taken to reach
 _DIGITS = 9  # significant, of numbers in the tables
 
 _NO_EVENT = {
-    "damping": "passive damping: randomize_actuator_gains would set the controller's gain instead; "
-    "write it as the joint's viscous friction"
+    "joint.damping": "passive damping: randomize_actuator_gains would set the controller's gain instead; "
+    "write it as the joint's viscous friction",
+    **dict.fromkeys(
+        ("tendon.stiffness", "tendon.damping", "tendon.springlength"),
+        "randomize_fixed_tendon_parameters sets its like where the asset has a fixed tendon of PhysX",
+    ),
 }
 _FRICTION = (
     "dry friction in N m: Isaac Sim 5 and later draw static, dynamic and viscous friction by it, "
@@ -70,11 +74,11 @@ def randomize_fn(model, rng):
             raise ValueError(
                 f"model: {{name}} is not that of the calibrated model, and MJX fixes it on loading; load identified.xml"
             )
-    rubs = [float(model.dof_frictionloss[place]) > 0 for place in TABLE.get("dof_frictionloss", ((), ()))[0]]
-    if not all(rubs):
-        raise ValueError(
-            "model: dof_frictionloss is 0 where it is drawn, and MJX then knows no friction there; load identified.xml"
-        )
+    for name in ("dof_frictionloss", "tendon_frictionloss"):
+        if not all(float(getattr(model, name)[place]) > 0 for place in TABLE.get(name, ((), ()))[0]):
+            raise ValueError(
+                f"model: {{name}} is 0 where it is drawn, and MJX then knows no friction there; load identified.xml"
+            )
 
     def field(name):
         part_of = model
@@ -281,7 +285,8 @@ def _terms(environment: MjcfEnvironment, draws: FloatArray, uncalibrated: Sequen
             term = None if target.startswith("sensor:") else _event(target, values)
             label = "".join(c if c.isalnum() else "_" for c in f"{parameter.name}_{number}" if c.isascii())
             if term is None:
-                why = _NO_EVENT.get(target.rpartition(".")[2], "no event of Isaac Lab sets it")
+                sort = f"{target.partition(':')[0]}.{target.rpartition('.')[2]}"
+                why = _NO_EVENT.get(sort, "no event of Isaac Lab sets it")
                 size = f"{values.mean():.6g} +- {values.std():.2g} {parameter.unit}"
                 lines.append(f"    # {printed(target)}: {size}; {why}")
             else:

@@ -19,9 +19,10 @@ OBJECTS = {
     "joint": mujoco.mjtObj.mjOBJ_JOINT,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
     "geom": mujoco.mjtObj.mjOBJ_GEOM,
+    "tendon": mujoco.mjtObj.mjOBJ_TENDON,
     "sensor": mujoco.mjtObj.mjOBJ_SENSOR,
 }
-_COUNTS = {"body": "nbody", "joint": "njnt", "actuator": "nactuator", "geom": "ngeom", "sensor": "nsensor"}
+_COUNTS = {kind: f"n{kind}" for kind in OBJECTS} | {"joint": "njnt"}
 _AT_HINGE = {"force": "N m", "position": "rad", "velocity": "rad/s"}
 _AT_SLIDE = {"force": "N", "position": "m", "velocity": "m/s"}
 _SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))

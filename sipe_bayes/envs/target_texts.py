@@ -61,6 +61,16 @@ TARGET_TEXTS: dict[str, dict[str, str]] = {
         "residual_command": "the same, in the command's unit",
         **dict.fromkeys((f"residual_{k}" for k in range(12)), "weights of the residual force, N m or N"),
     },
+    "tendon": {
+        "stiffness": "spring along it, N/m; N m/rad of hinges whose coefficients are 1, as below",
+        "damping": "viscous friction along it, N s/m or N m s/rad",
+        "frictionloss": "dry friction along it, of a cable in its sheath, N or N m",
+        "armature": "inertia that its length moves, of a winch's rotor, kg or kg m^2",
+        "springlength": "length at which the spring rests, m or rad",
+        "springlength_low": "of a spring that rests over a range its least length: shorter ones are pushed",
+        "springlength_high": "and its greatest: longer ones are pulled",
+        "coef": "of a fixed tendon, NAME is TENDON/JOINT: its length per rad or m of the joint, a pulley's radius",
+    },
     "actuator": {
         "gear": "transmission ratio",
         "gain": "force for each unit of command",

@@ -17,14 +17,15 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.validation import nearest_name
-from sipe_bayes.envs.contact_targets import GEOM_CONTACTS, PAIR_CONTACTS, pair_index
 from sipe_bayes.envs.inertia import body_frame_inertia
 from sipe_bayes.envs.internal.elastic import ELASTIC, NUMBERS, motor_side, realise
+from sipe_bayes.envs.kinds.contacts import GEOM_CONTACTS, PAIR_CONTACTS, pair_index
+from sipe_bayes.envs.kinds.tendons import TENDONS, wrap_index
 from sipe_bayes.envs.laws.base import SINGLE, Number
 from sipe_bayes.envs.laws.registry import LAW_OF
 from sipe_bayes.envs.target import Check, Maker, Target, TargetError, actuator_unit, entry, named
 
-_PATTERN = re.compile(r"^(?:(body|joint|actuator|geom|pair):(.+)|(option))\.([a-z0-9_]+)$")
+_PATTERN = re.compile(r"^(?:(body|joint|tendon|actuator|geom|pair):(.+)|(option))\.([a-z0-9_]+)$")
 _AXES = ("x", "y", "z")
 _DC_MOTOR, _PID = mujoco.mjtGain.mjGAIN_DCMOTOR, mujoco.mjtGain.mjGAIN_PID
 
@@ -52,6 +53,8 @@ def bind(model: mujoco.MjModel, spec: str) -> Target:
         raise TargetError(f"target {spec!r}: {article} {kind} has no attribute {attribute!r}{hint}")
     if kind in ("option", "pair"):
         index = 0 if kind == "option" else pair_index(model, name, spec)
+    elif (kind, attribute) == ("tendon", "coef"):
+        index = wrap_index(model, name, spec)
     else:
         index = named(model, kind, name, f"target {spec!r}")
     target = legal[attribute](model, spec, index)
@@ -344,6 +347,7 @@ ATTRIBUTES: dict[str, dict[str, Maker]] = {  # kind -> attribute -> what binds i
         **{number.attribute: _numeric(number, ELASTIC, slot) for slot, number in enumerate(NUMBERS)},
         **_laws("joint"),
     },
+    "tendon": TENDONS,
     "actuator": {
         "gear": entry("actuator_gear", "1", 0, constants=True),
         "gain": entry("actuator_gainprm", "force/command", 0, _fixed_gain),

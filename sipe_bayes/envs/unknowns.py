@@ -17,7 +17,12 @@ from sipe_bayes.envs.target import TargetError
 from sipe_bayes.envs.targets import bind
 
 # the numbers that a target writes, where they are not its own
-_WRITES = {"kp": ("gain", "bias_position"), "kv": ("bias_velocity",), "offset": ("bias_force",)}
+_WRITES = {
+    "actuator.kp": ("gain", "bias_position"),
+    "actuator.kv": ("bias_velocity",),
+    "actuator.offset": ("bias_force",),
+    "tendon.springlength": ("springlength_low", "springlength_high"),
+}
 
 
 def check_conflicts(space: ParameterSpace) -> None:
@@ -28,7 +33,7 @@ def check_conflicts(space: ParameterSpace) -> None:
             head, _, attribute = spec.rpartition(".")
             if attribute == "bias":  # they add up
                 continue
-            numbers = _WRITES.get(attribute, (attribute,)) if head.startswith("actuator:") else (attribute,)
+            numbers = _WRITES.get(f"{head.partition(':')[0]}.{attribute}", (attribute,))
             for number in numbers:
                 for other, log in owners.setdefault(f"{head}.{number}", []):
                     if log is None or parameter.log is None or log == parameter.log:

@@ -37,7 +37,7 @@ from sipe_bayes.envs.targets import bind
 from sipe_bayes.envs.unknowns import physical_targets
 from sipe_bayes.structure.machine import Machine
 
-Kind = Literal["joint", "actuator", "body", "channel", "world"]
+Kind = Literal["joint", "tendon", "actuator", "body", "channel", "world"]
 KINDS: tuple[str, ...] = get_args(Kind)
 PROBE = 0.03  # of a parameter's range, how far a probe goes: an effect that is still about linear
 WORLD = "world"  # the one site of an extension of the world
@@ -127,7 +127,7 @@ class Placed:
 
     Args:
         extension: which.
-        site: name of the joint, actuator, body or channel, or of several that are moved alike; ``WORLD``.
+        site: name of the joint, tendon, actuator, body or channel, or of several that are moved alike; ``WORLD``.
         parameters: its unknowns, with the model's own values as defaults.
         edit: what it changes in the MJCF.
         probes: theta (G, K, P) at which it is tried, for each of G shapes.
@@ -173,6 +173,7 @@ def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
     """The extension wherever the machine has a place for it."""
     sites = {
         "joint": tuple(machine.joints),
+        "tendon": tuple(machine.tendons),
         "actuator": machine.environment.actuators,
         "body": tuple(machine.bodies),
         "channel": machine.environment.channels,

@@ -9,6 +9,8 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.envs.internal.elastic import motor_side
+from sipe_bayes.envs.kinds.tendons import tendon_arms
 from sipe_bayes.envs.laws.base import SINGLE
 from sipe_bayes.envs.laws.bound import driven_joint
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -34,6 +36,25 @@ class JointSizes:
     velocity: float
     force: float
     inertia: float
+
+
+@dataclass(frozen=True)
+class TendonSizes:
+    """Along the logs of one tendon that moves, in m and N (in rad and N m where it is made up of hinges' angles).
+
+    Args:
+        length: its mean.
+        stretch: the standard deviation of its length.
+        velocity: root-mean-square.
+        force: that the forces of the joints that it moves amount to along it.
+        least: the smallest length that it may have; -inf of sums of joints' positions.
+    """
+
+    length: float
+    stretch: float
+    velocity: float
+    force: float
+    least: float
 
 
 @dataclass(frozen=True)
@@ -63,6 +84,7 @@ class Machine:
     Args:
         environment: the user's model.
         joints: of each hinge and slide joint.
+        tendons: of each that joints move.
         forces: root-mean-square of each commanded actuator's force.
         commands: largest size of each command.
         channels: spread of each measured channel.
@@ -72,6 +94,7 @@ class Machine:
 
     environment: MjcfEnvironment
     joints: dict[str, JointSizes]
+    tendons: dict[str, TendonSizes]
     forces: dict[str, float]
     commands: dict[str, float]
     channels: dict[str, float]
@@ -154,7 +177,8 @@ def machine_of(windows: Windows, theta: FloatArray, starts: FloatArray) -> Machi
     spread = np.nanstd(windows.trajectories.observations, axis=(0, 1))
     channels = dict(zip(environment.channels, np.maximum(spread, 1e-9).tolist(), strict=True))
     names = tuple(str(name) for name in windows.trajectories.names)
-    return Machine(environment, joints, forces, commands, channels, names, float(windows.dt.min()))
+    tendons = _tendons(model, states, own.size)
+    return Machine(environment, joints, tendons, forces, commands, channels, names, float(windows.dt.min()))
 
 
 def _turned(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> tuple[bool, bool, bool]:
@@ -222,6 +246,28 @@ def _forces(model: mujoco.MjModel, states: FloatArray, controls: FloatArray) -> 
         diagonals.append(np.diag(inertia).copy())
         parts.append(np.abs([data.qfrc_actuator, data.qfrc_bias, inertia @ data.qacc]).max(0))
     return np.array(driving), _Own(np.sqrt((np.array(parts) ** 2).mean(0)), np.mean(diagonals, axis=0))
+
+
+def _tendons(model: mujoco.MjModel, states: FloatArray, forces: FloatArray) -> dict[str, TendonSizes]:
+    """Of the tendons that move, from states (n, S) and sizes of the dofs' forces (nv,)."""
+    data, rows = mujoco.MjData(model), []
+    for state in states if model.ntendon else ():
+        mujoco.mj_setState(model, data, np.ascontiguousarray(state), mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fwdVelocity(model, data)
+        arms = np.abs(tendon_arms(model, data))
+        rows.append((data.ten_length.copy(), data.ten_velocity.copy(), arms @ forces, (arms**2).sum(1)))
+    sizes, gears = {}, {motor_side(model, model.joint(joint).name) for joint in range(model.njnt)}
+    for tendon in set(range(model.ntendon)) - gears:  # the motor's side of a joint is that joint's
+        length, velocity, pull, square = (np.array([row[k][tendon] for row in rows]) for k in range(4))
+        if model.tendon(tendon).name and length.std() > 0 and square.mean() > 0:
+            force = float(pull.mean() / square.mean())
+            by_joints = int(model.wrap_type[model.tendon_adr[tendon]]) == int(mujoco.mjtWrap.mjWRAP_JOINT)
+            least = -np.inf if by_joints else 0.0
+            sizes[str(model.tendon(tendon).name)] = TendonSizes(
+                float(length.mean()), float(length.std()), max(_rms(velocity), 1e-9), max(force, 1e-9), least
+            )
+    return sizes
 
 
 def _rms(x: FloatArray) -> float:

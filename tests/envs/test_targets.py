@@ -21,7 +21,7 @@ from sipe_bayes.envs.laws.registry import LAW_OF, LAWS
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.target import TargetError
 from sipe_bayes.envs.targets import bind
-from tests.problems import motors
+from tests.problems import motors, tendons
 
 XML = f"""<mujoco><option timestep="0.002" density="1.2" viscosity="1e-5"/><worldbody>
   <geom name="floor" type="plane" size="3 3 .1"/>
@@ -32,11 +32,11 @@ XML = f"""<mujoco><option timestep="0.002" density="1.2" viscosity="1e-5"/><worl
       <inertial pos=".01 .02 .03" mass=".5" fullinertia=".01 .012 .008 .001 -.002 .0015"/>
       <geom name="ball" size=".05" mass=".1"/></body></body>
   <body name="aligned" pos="1 0 1"><joint name="hinge2" axis="0 1 0" armature=".02"/>
-    <inertial pos="0 0 -.2" mass=".3" diaginertia=".004 .003 .002"/></body>
+    <inertial pos="0 0 -.2" mass=".3" diaginertia=".004 .003 .002"/><site name="fixed"/></body>
   <body name="box" pos="2 0 1"><freejoint name="free"/>
     <geom name="box" type="box" size=".1 .2 .3" mass="2"/></body>
   <body name="top" pos="3 0 1"><joint name="spin" type="ball"/><geom size=".1" mass="1" pos="0 0 .3"/></body>
-  </worldbody><contact><pair name="ends" geom1="box" geom2="ball" solref=".03 .9"/></contact><actuator>
+  </worldbody>{tendons.XML}<contact><pair name="ends" geom1="box" geom2="ball" solref=".03 .9"/></contact><actuator>
   <motor name="motor" joint="hinge" gear="2"/>
   <position name="position" joint="slide" kp="30" kv="2"/>
   <general name="general" joint="hinge2" gainprm="4" biastype="affine" biasprm=".1 -3 -.2"
@@ -48,7 +48,7 @@ XML = f"""<mujoco><option timestep="0.002" density="1.2" viscosity="1e-5"/><worl
   <general name="slow" joint="hinge2" dyntype="filterexact" dynprm=".02" actearly="true"/>
   {motors.MOTORS}</actuator></mujoco>"""
 
-Edit = Callable[[Any, float], None]
+Edit = Callable[[Any, float], Any]  # of an element, or what to read in the place of the tendons' text
 
 
 def vector(attribute: str, slot: int) -> Edit:
@@ -89,16 +89,6 @@ def offset(element: Any, value: float) -> None:
 
 def limit(element: Any, value: float) -> None:
     element.forcelimited, element.forcerange = True, [-value, value]
-
-
-def sliding(element: Any, value: float) -> None:
-    vector("friction", 0)(element, value)
-    vector("friction", 1)(element, value)
-
-
-def rolling(element: Any, value: float) -> None:
-    vector("friction", 3)(element, value)
-    vector("friction", 4)(element, value)
 
 
 def command_limit(element: Any, value: float) -> None:
@@ -182,6 +172,7 @@ CASES: list[tuple[str, float, str, Edit]] = [
     ("joint:slide.damping_cubic", 0.2, "N/(m/s)^3", vector("damping", 2)),
     ("joint:slide.stiffness_quadratic", -4.0, "N/(m)^2", vector("stiffness", 1)),
     ("joint:hinge.stiffness_cubic", 4.0, "N m/(rad)^3", vector("stiffness", 2)),
+    *tendons.CASES,
     ("actuator:motor.gear", 3.0, "1", vector("gear", 0)),
     ("actuator:position.gear", 1.5, "1", vector("gear", 0)),
     ("actuator:motor.gain", 2.5, "N m/command", vector("gainprm", 0)),
@@ -209,9 +200,9 @@ CASES: list[tuple[str, float, str, Edit]] = [
     ("geom:ball.solimp_midpoint", 0.4, "1", vector("solimp", 3)),
     ("geom:ball.solimp_power", 3.0, "1", vector("solimp", 4)),
     ("geom:ball.margin", 0.01, "m", scalar("margin")),
-    ("pair:ends.friction", 0.4, "1", sliding),
+    ("pair:ends.friction", 0.4, "1", tendons.number("friction", 0, 1)),
     ("pair:ends.friction_torsional", 0.01, "m", vector("friction", 2)),
-    ("pair:ball/box.friction_rolling", 0.003, "m", rolling),
+    ("pair:ball/box.friction_rolling", 0.003, "m", tendons.number("friction", 3, 4)),
     ("pair:box/ball.solref_timeconst", 0.05, "s", vector("solref", 0)),
     ("pair:ends.solref_dampratio", 0.3, "1", vector("solref", 1)),
     ("pair:ends.solimp_dmin", 0.8, "1", vector("solimp", 0)),
@@ -234,9 +225,9 @@ CASES: list[tuple[str, float, str, Edit]] = [
 ]
 
 
-def frozen_spec() -> Any:
+def frozen_spec(xml: str = XML) -> Any:
     """The spec with its bodies' inertia written out, so that it may be edited, and every law."""
-    spec = mujoco.MjSpec.from_string(XML)
+    spec = mujoco.MjSpec.from_string(xml)
     give_way(spec)
     for law in LAWS.values():
         declare(spec, law.kind, LAW_AT[law.kind].partition(":")[2], law)
@@ -256,6 +247,8 @@ def element(spec: Any, target: str) -> Any:
         return next(numeric for numeric in spec.numerics if numeric.name == label)
     if kind == "pair":
         return spec.pairs[0]
+    if kind == "tendon":
+        return spec.tendon(name if attribute != "coef" else name.rpartition("/")[0])
     if name == TWIST:
         return spec
     return spec.option if kind == "option" else getattr(spec, kind)(name)
@@ -290,7 +283,8 @@ def written(model: Any, *writes: tuple[str, float]) -> Any:
 @pytest.mark.parametrize(("target", "value", "unit", "edit"), CASES, ids=[c[0] for c in CASES])
 def test_writing_in_place_is_compiling_the_edited_model(target: str, value: float, unit: str, edit: Edit) -> None:
     model, spec = frozen_spec().compile(), frozen_spec()
-    edit(element(spec, target), value)
+    text = edit(element(spec, target), value)
+    spec = frozen_spec(XML.replace(tendons.XML, text)) if text else spec
     assert_same(written(model, (target, value)), spec.compile(), target)
     bound = bind(model, target)
     assert bound.unit == unit
@@ -372,7 +366,8 @@ def test_a_limit_that_the_model_has_not_is_endless(tmp_path: Path) -> None:
 WRONG = [
     ("rod.mass", "expected KIND:NAME.ATTRIBUTE with KIND one of"),
     ("body:rod", "expected KIND:NAME.ATTRIBUTE"),
-    ("tendon:t.stiffness", "expected KIND:NAME.ATTRIBUTE"),
+    ("site:s.stiffness", "expected KIND:NAME.ATTRIBUTE"),
+    *tendons.WRONG,
     ("body:rod.masss", "a body has no attribute 'masss'; did you mean 'mass'"),
     ("option.quux", "an option has no attribute 'quux'; known: density"),
     ("body:rodd.mass", "the model has no body 'rodd'; did you mean 'rod'"),

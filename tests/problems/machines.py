@@ -17,6 +17,7 @@ _DOUBLE = """<mujoco><option timestep="0.004" integrator="implicitfast"><flag co
     <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass="1"/>
     <body name="lower" pos="0 0 -.4"><joint name="elbow" axis="0 1 0" damping="0.05" armature="0.005"/>
       <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".5"/></body></body></worldbody>
+  <tendon><fixed name="cable"><joint joint="shoulder" coef=".05"/><joint joint="elbow" coef=".03"/></fixed></tendon>
   <actuator><motor name="m1" joint="shoulder" gear="2"/><position name="m2" joint="elbow" kp="4" kv=".3"/></actuator>
   </mujoco>"""
 _SLIDE = """<mujoco><option timestep="0.004"><flag contact="disable"/></option><worldbody>

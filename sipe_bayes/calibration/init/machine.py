@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.envs.kinds.tendons import tendon_arms
 
 _GRAVITY, _BRISK = 9.81, 10.0  # m/s^2, rad/s^2 or m/s^2: motions of unknown machines
 _NO_MASS = 0.01  # of all that a body carries
@@ -122,7 +123,10 @@ class Machine:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Of each joint by name: force or torque, speed and inertia that are usual in the logs, in SI."""
+    """Of each joint by name: force or torque, speed and inertia that are usual in the logs, in SI.
+
+    Of each tendon that moves as ``tendon:NAME``, along its length.
+    """
 
     force: dict[str, float]
     speed: dict[str, float]
@@ -149,12 +153,20 @@ class Sizes:
             speed = np.abs(data.qvel.copy())
             moving = _BRISK * inertia if states is None else np.zeros(model.nv)
             gravity = np.abs(data.qfrc_bias) + (0.5 * _GRAVITY * np.sqrt(inertia) if states is None else 0.0)
-            forces.append(np.abs(data.qfrc_actuator) + gravity + moving)
-            speeds.append(speed if states is not None else np.full(model.nv, 3.0))
-            inertias.append(inertia)
+            arms = tendon_arms(model, data)
+            carried = _carried(full, arms)
+            pulls = _pulls(model, data) + (_BRISK * carried if states is None else 0.0)
+            forces.append([*(np.abs(data.qfrc_actuator) + gravity + moving), *pulls])
+            usual = np.full(model.nv, 3.0)
+            speeds.append(
+                [*speed, *np.abs(arms @ data.qvel)] if states is not None else [*usual, *np.abs(arms) @ usual]
+            )
+            inertias.append([*inertia, *carried])
         force, speed = np.quantile(forces, 0.9, axis=0), np.quantile(speeds, 0.9, axis=0)
         inertia = np.mean(inertias, axis=0)
         at = {joint.name: int(model.joint(joint.name).dofadr[0]) for joint in machine.joints}
+        moved = [t for t in range(model.ntendon) if inertia[model.nv + t] > 0]
+        at |= {f"tendon:{model.tendon(t).name}": model.nv + t for t in moved}
 
         def by_name(values: FloatArray, least: float) -> dict[str, float]:
             return {name: max(float(values[i]), least) for name, i in at.items()}
@@ -212,6 +224,20 @@ def _resists(model: mujoco.MjModel, joint: int) -> bool:
     dof = int(model.jnt_dofadr[joint])
     fields = (model.dof_damping, model.dof_frictionloss, model.dof_armature)
     return bool(model.jnt_stiffness[joint]) or any(bool(field[dof]) for field in fields)
+
+
+def _carried(inertia: FloatArray, arms: FloatArray) -> FloatArray:
+    """What each tendon moves as a mass at its end, of joints' inertia (nv, nv); 0 of those that nothing moves."""
+    yielding = np.einsum("tv,vt->t", arms, np.linalg.solve(inertia, arms.T)) if len(arms) else np.zeros(0)
+    return np.divide(1.0, yielding, out=np.zeros(len(arms)), where=yielding > 0)
+
+
+def _pulls(model: mujoco.MjModel, data: mujoco.MjData) -> FloatArray:
+    """What actuators and its own spring pull at each tendon (ntendon,), as sizes."""
+    pulls = model.tendon_stiffness * np.abs(data.ten_length - np.clip(data.ten_length, *model.tendon_lengthspring.T))
+    at = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
+    np.add.at(pulls, model.actuator_trnid[at, 0], np.abs(data.actuator_force * model.actuator_gear[:, 0])[at])
+    return np.asarray(pulls)
 
 
 def _is_thrust(model: mujoco.MjModel, index: int) -> bool:

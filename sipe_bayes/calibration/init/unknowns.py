@@ -15,11 +15,11 @@ from sipe_bayes.calibration.init.fits import Fit, rounded_up
 from sipe_bayes.calibration.init.machine import (
     Actuator,
     Drive,
-    Joint,
     Machine,
     Sizes,
     bases,
 )
+from sipe_bayes.calibration.init.resistance import of_joint, of_tendons
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.inertia import body_frame_inertia
@@ -68,7 +68,8 @@ def candidates(
     bodies = [model.body(body).id for body in machine.bodies]  # what is pushed, or carries joints
     free = bodies if driven else []  # what is only thrown moves alike whatever its mass
     masses, attached = _masses(model, [*behind, *free])
-    of_joints = [u for joint in joints if not joint.base for u in _of_joint(model, joint, sizes)]
+    of_joints = of_tendons(model, [a for a, _ in driven], sizes) if joints else []
+    of_joints += [u for joint in joints if not joint.base for u in of_joint(model, joint, sizes)]
     if open_scale and len(joints) < 2:  # a rotor is so much more mass, to which the gain is relative
         of_joints = [u for u in of_joints if not u.name.endswith("_armature")]
     flown = [body for body in bodies if body in {_thrust_at(model, a) for a, _ in driven}]
@@ -224,28 +225,6 @@ def _masses(model: mujoco.MjModel, bodies: Sequence[int]) -> tuple[list[Unknown]
                 unknown = _factor(f"{word_of(name)}_mass", f"body:{name}.mass", 0.5, 2.0, note)
                 (attached if k else heaviest).append(unknown)
     return heaviest, attached
-
-
-def _of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes) -> list[Unknown]:
-    """Friction, the inertia of rotor and gears, and the spring where the model has one."""
-    name, at, dof = joint.name, f"joint:{joint.name}", int(model.joint(joint.name).dofadr[0])
-    force, speed, inertia = (table[name] for table in (sizes.force, sizes.speed, sizes.inertia))
-    damping, dry, rotor = (
-        float(getattr(model, f"dof_{field}")[dof]) for field in ("damping", "frictionloss", "armature")
-    )
-    word = word_of(name)
-    rows = (
-        ("damping", rounded_up(max(4 * damping, 0.5 * force / speed)), damping, "viscous friction"),
-        ("frictionloss", rounded_up(max(4 * dry, 0.4 * force)), dry, "dry friction"),
-        ("armature", rounded_up(max(4 * rotor, 0.6 * inertia)), rotor, "inertia of rotor and gears"),
-    )
-    out = [
-        Unknown(f"{word}_{field}", (f"{at}.{field}",), 0.0, high, False, f"{what}, {own:g} in the model")
-        for field, high, own, what in rows
-    ]
-    if (spring := float(np.ravel(model.joint(name).stiffness)[0])) > 0:
-        out.append(_factor(f"{word}_stiffness", f"{at}.stiffness", 0.5, 2.0, f"spring, {spring:g} in the model"))
-    return out
 
 
 def as_parameters(model: mujoco.MjModel, unknowns: Sequence[Unknown]) -> list[Parameter]:

@@ -1,0 +1,1 @@
+"""Targets of one kind of object each: contacts, tendons."""
