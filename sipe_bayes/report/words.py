@@ -51,9 +51,11 @@ def error_text(value: float) -> str:
 
 
 def times(ratio: float) -> str:
-    """An error ratio (model as given over calibrated) in words."""
+    """An error ratio (model as given over calibrated) in words; 0 where simulations of the calibrated one diverge."""
     if not math.isfinite(ratio):
         return "–"
+    if not ratio:
+        return "it diverges"
     if 1 / THRESHOLDS.alike < ratio < THRESHOLDS.alike:
         return "about the same"
     factor, word = (ratio, "smaller") if ratio > 1 else (1 / ratio, "larger")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from sipe_bayes.core.findings import Code, finding, singular
-from sipe_bayes.diagnostics.records import ChannelNoise
+from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, improvement
 from sipe_bayes.report.templates import breakable
-from sipe_bayes.report.words import correlation_time, unit_text, with_unit
+from sipe_bayes.report.words import correlation_time, times, unit_text, with_unit
 
 
 @pytest.mark.parametrize(
@@ -26,6 +28,21 @@ from sipe_bayes.report.words import correlation_time, unit_text, with_unit
 )
 def test_one_unit_stands_beside_a_name(name: str, unit: str, text: str) -> None:
     assert with_unit(name, unit) == text
+
+
+@pytest.mark.parametrize(
+    ("rmse_default", "rmse", "text"),
+    [
+        (0.3, 0.1, "3.0 times smaller"),
+        (0.1, 0.3, "3.0 times larger"),
+        (0.1, 0.1, "about the same"),
+        (0.1, math.inf, "it diverges"),
+        (math.inf, 0.1, "–"),
+        (math.inf, math.inf, "–"),
+    ],
+)
+def test_what_became_of_an_error(rmse_default: float, rmse: float, text: str) -> None:
+    assert times(improvement([ChannelScore("log", "angle", "rad", rmse, rmse_default)])) == text
 
 
 @pytest.mark.parametrize(
