@@ -36,10 +36,14 @@ class ChannelScore:
 
 
 def improvement(scores: Iterable[ChannelScore]) -> float:
-    """How many times smaller the error became: geometric mean over logs and channels; NaN when none compares."""
+    """How many times smaller the error became: geometric mean over logs and channels; NaN when none compares.
+
+    0 where simulations of the calibrated model diverge.
+    """
     ratios = [s.rmse_default / s.rmse for s in scores if s.rmse > 0 and s.rmse_default > 0]
     ratios = [r for r in ratios if math.isfinite(r)]
-    return float(np.exp(np.mean(np.log(ratios)))) if ratios else math.nan
+    with np.errstate(divide="ignore"):  # of a model that diverges
+        return float(np.exp(np.mean(np.log(ratios)))) if ratios else math.nan
 
 
 @dataclass(frozen=True)
