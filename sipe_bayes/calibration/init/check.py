@@ -22,7 +22,7 @@ from sipe_bayes.calibration.init.machine import Machine, Sizes
 from sipe_bayes.calibration.init.readings import with_velocities
 from sipe_bayes.calibration.init.tables import Opened, open_table
 from sipe_bayes.calibration.init.trials import Assumption, Trial, followed
-from sipe_bayes.calibration.init.unknowns import springs
+from sipe_bayes.calibration.init.unknowns.candidates import springs
 from sipe_bayes.calibration.init.windows import (
     FEW,
     MANY,

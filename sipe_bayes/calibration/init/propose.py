@@ -14,7 +14,6 @@ from sipe_bayes.calibration.init.absolute import absolute_angles, with_zeros
 from sipe_bayes.calibration.init.columns.match import Match, Matches
 from sipe_bayes.calibration.init.columns.matching import match_columns
 from sipe_bayes.calibration.init.columns.names import TURNS, pieces_of
-from sipe_bayes.calibration.init.contacts import nameless
 from sipe_bayes.calibration.init.decisions import decide
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading, Unknown
 from sipe_bayes.calibration.init.fits import delay_of, fit
@@ -25,15 +24,9 @@ from sipe_bayes.calibration.init.machine import Machine, Sizes, touching_bodies
 from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
 from sipe_bayes.calibration.init.tables import Opened, open_table
 from sipe_bayes.calibration.init.trials import Trial
-from sipe_bayes.calibration.init.unknowns import (
-    RELATIVE,
-    candidates,
-    roomy,
-    scale_is_open,
-    springs,
-    sprung,
-    told_apart,
-)
+from sipe_bayes.calibration.init.unknowns.candidates import candidates, scale_is_open, springs
+from sipe_bayes.calibration.init.unknowns.choice import RELATIVE, chosen, roomy, sprung
+from sipe_bayes.calibration.init.unknowns.contacts import nameless
 from sipe_bayes.calibration.init.windows import (
     FEW,
     MANY,
@@ -353,8 +346,8 @@ def _unknowns(
     late, note = delay_of(actuators, left, logs[0].dt)
     samples = left.finer if late else 0.0
     given = trial.simulator.space.default_theta
-    shown = told_apart(unknowns, left, given, scale_is_open(model, machine, draft.readings))
-    shown = [u if u.left_out else roomy(model, u, float(x)) for u, x in zip(shown, left.theta, strict=False)]
+    shown, values = chosen(model, unknowns, left, given, scale_is_open(model, machine, draft.readings))
+    shown = [u if u.left_out else roomy(model, u, float(x)) for u, x in zip(shown, values, strict=False)]
     notes = [note] if note and not late else []
     notes += [*nameless(model, touching - {model.body(body).id for body in machine.bodies})]
     lost = trial.unfollowed(replace(trial.given, delay=left.best), left.theta)

@@ -15,7 +15,7 @@ from sipe_bayes.calibration.init.decisions import Layout
 from sipe_bayes.calibration.init.draft import Draft, Reading, Unknown
 from sipe_bayes.calibration.init.machine import Drive, Machine, Sizes
 from sipe_bayes.calibration.init.trials import Trial
-from sipe_bayes.calibration.init.unknowns import as_parameters, candidates
+from sipe_bayes.calibration.init.unknowns.candidates import as_parameters, candidates
 from sipe_bayes.calibration.logs import load_logs
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.channels import Channel

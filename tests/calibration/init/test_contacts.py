@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from sipe_bayes.calibration.init.contacts import nameless
 from sipe_bayes.calibration.init.draft import Unknown
 from sipe_bayes.calibration.init.machine import Machine
-from sipe_bayes.calibration.init.unknowns import as_parameters
+from sipe_bayes.calibration.init.unknowns.candidates import as_parameters
+from sipe_bayes.calibration.init.unknowns.contacts import nameless
 from sipe_bayes.calibration.init.windows import rough_unknowns
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import bind

@@ -12,7 +12,7 @@ import pytest
 
 from sipe_bayes.calibration.init.draft import Draft
 from sipe_bayes.calibration.init.propose import propose
-from sipe_bayes.calibration.init.unknowns import RELATIVE
+from sipe_bayes.calibration.init.unknowns.choice import RELATIVE
 
 PLACES = np.array([(0.2, 0.15), (0.2, -0.15), (-0.2, 0.15), (-0.2, -0.15)])
 SITES = "".join(f'<site name="t{k}" pos="{x} {y} 0"/>' for k, (x, y) in enumerate(PLACES))

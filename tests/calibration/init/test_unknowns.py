@@ -8,7 +8,7 @@ import pytest
 
 from sipe_bayes.calibration.init.draft import Unknown
 from sipe_bayes.calibration.init.fits import Fit, delay_of
-from sipe_bayes.calibration.init.unknowns import roomy, sprung, told_apart
+from sipe_bayes.calibration.init.unknowns.choice import roomy, sprung, told_apart
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from sipe_bayes.calibration.init.contacts import word_of
 from sipe_bayes.calibration.init.draft import Unknown
 from sipe_bayes.calibration.init.fits import rounded_up
 from sipe_bayes.calibration.init.machine import Actuator, Joint, Sizes
+from sipe_bayes.calibration.init.unknowns.contacts import word_of
 
 
 def of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes) -> list[Unknown]:
