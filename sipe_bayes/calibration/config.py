@@ -45,7 +45,7 @@ from sipe_bayes.calibration.readers.many import episodes_of
 from sipe_bayes.core.files import read_text, reading
 from sipe_bayes.core.units import find_unit
 from sipe_bayes.core.validation import MOST
-from sipe_bayes.diagnostics.misfit.tolerances import GEOMETRY
+from sipe_bayes.diagnostics.misfit.tolerances import GEOMETRY, TIMING
 
 
 class Config(Table):
@@ -70,8 +70,12 @@ class Config(Table):
     """rollouts of the search: one parameter vector simulated over one log; default the estimator's own. Checks
     afterwards (each log alone, dead ranges, what the model lacks, the prior's simulations, bands) come on top"""
     geometry_tolerance: Tolerance = GEOMETRY
-    """sd of where centres of mass lie, as a share of the body's radius of gyration about the joint that turns it;
-    intervals with what the model lacks allow for it where no log tells. 0: exact"""
+    """sd of where centres of mass lie, as a share of the body's radius of gyration about the joint that turns it, and
+    of masses that are not unknown, as a share of them; intervals with what the model lacks allow for it where no log
+    tells. 0: exact"""
+    timing_tolerance: Tolerance = TIMING
+    """sd of when each measurement is taken, as a share of the time from sample to sample: loops read one joint after
+    the other. Intervals with what the model lacks allow for it where no log tells. 0: exact"""
     search: Search = Search()
     resample: Resample = Resample()
     columns: Columns = Columns()

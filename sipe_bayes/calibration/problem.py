@@ -77,9 +77,9 @@ class Problem:
 
     @property
     def tolerances(self) -> Tolerances:
-        """How well forces and geometry are known."""
+        """How well forces, drawings and times are known."""
         commands = {command.actuator: command.tolerance for command in self.config.commands}
-        return Tolerances(commands, self.config.geometry_tolerance)
+        return Tolerances(commands, self.config.geometry_tolerance, self.config.timing_tolerance)
 
     @property
     def segments(self) -> Segments:

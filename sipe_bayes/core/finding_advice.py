@@ -160,9 +160,10 @@ ADVICE: dict[Code, str] = {
     Code.NOISE_FREE: "Nothing to do. A log from a machine has noise: add some before you judge what a log would tell.",
     Code.MISFIT_UNKNOWN: "Judge by the residuals in the report and by the held-out logs.",
     Code.UNTOLD: (
-        "Motion tells masses, inertias and friction only in the scale of the forces, and with where they lie. Weigh "
-        "one part and fix its mass with `actuator:NAME.gain` (a servo's `kp`) free; say by `tolerance` of the command "
-        "how well forces are known, by `geometry_tolerance` how well the drawing is."
+        "Motion tells masses, inertias and friction only in the scale of the forces, with where they lie, and delays "
+        "and a servo's gains with when each joint is read. Weigh one part and fix its mass with `actuator:NAME.gain` "
+        "(a servo's `kp`) free; say by `tolerance` of the command how well forces are known, by `geometry_tolerance` "
+        "how well the drawing is, by `timing_tolerance` how well time stamps are."
     ),
     Code.COLUMN_NOT_FOLLOWED: "Look whether the fit follows it; else at its zero, unit and sign.",
     Code.CHECKS_THINNED: "Nothing to do; `sipe discover` looks at all of them.",

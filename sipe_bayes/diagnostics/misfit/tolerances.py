@@ -1,7 +1,8 @@
-"""What numbers do to the values that no machine has exactly, and that no motion tells: forces, and centres of mass.
+"""What numbers do to the values that no machine has exactly, and that no motion tells: forces, drawings, clocks.
 
 A machine whose motors give a tenth more than the log says, with masses, inertias and friction a tenth larger, moves
-alike; and so does one with a lighter link whose centre of mass lies further out. Where theta can imitate another such
+alike; and so does one with a lighter link whose centre of mass lies further out. Joints that are read one after the
+other at one time stamp look like servos that are softer from one to the next. Where theta can imitate another such
 number but for a small part of what it does, the logs are not asked which it is: at that level the linearisation of dry
 friction is no better. Theta's answer to a number that is off by its tolerance is then what values are unknown by beside
 all that the logs tell.
@@ -30,25 +31,30 @@ class Tolerances:
 
     Args:
         commands: of what each actuator delivers, as a share of what its command says.
-        geometry: of where a body's centre of mass lies, as a share of its ``reach`` (``structure.machine``).
+        geometry: of where a body's centre of mass lies, as a share of its ``reach`` (``structure.machine``), and of a
+            mass that is not unknown, as a share of it.
+        timing: of when a measurement was taken, as a share of the time from sample to sample.
     """
 
     commands: Mapping[str, float] = field(default_factory=dict)
     geometry: float = 0.0
+    timing: float = 0.0
 
     def of(self, probe: Probe) -> float:
         """The sd of the number that a probe changes."""
-        body = probe.extension is not None and probe.extension.kind == "body"
-        return self.geometry if body else self.commands.get(probe.site, 0.0)
+        if probe.extension is None:
+            return 0.0
+        shares = {"body": self.geometry, "channel": self.timing, "actuator": self.commands.get(probe.site, 0.0)}
+        return shares.get(probe.extension.kind, 0.0)
 
 
 EXACT = Tolerances()
-COMMANDS, GEOMETRY = 0.1, 0.05  # the usual sds: what motor constants and drawings are known to
+COMMANDS, GEOMETRY, TIMING = 0.1, 0.05, 0.05  # the usual sds: of motor constants, drawings, and loops that read joints
 
 
 def usual(actuators: Sequence[str]) -> Tolerances:
     """Those of machines of which nobody has said more."""
-    return Tolerances(dict.fromkeys(actuators, COMMANDS), GEOMETRY)
+    return Tolerances(dict.fromkeys(actuators, COMMANDS), GEOMETRY, TIMING)
 
 
 @dataclass(frozen=True)

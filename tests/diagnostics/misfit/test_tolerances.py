@@ -105,3 +105,33 @@ def test_a_centre_of_mass_that_no_motion_tells_moves_mass_and_inertia_as_one_tha
     windows, values = Windows(Segments(0.5), known, logs), np.array([0.6, 0.08, -length])
     seen = ProbedLogs(windows, known.space.normalise(values), seen.noise)
     assert untold(seen, Tolerances(geometry=0.05)) == []
+
+
+def test_a_mass_that_is_not_asked_for_is_what_forces_and_friction_are_relative_to() -> None:
+    """With the rod's mass as in the model a twentieth of it is a twentieth of the motor's gain and of the damping."""
+    unknowns = [
+        Parameter("gain", 0.5, 1.5, targets=("actuator:motor.gain",)),
+        Parameter("damping", 0.0, 0.2, targets=("joint:hinge.damping",)),
+    ]
+    simulator = Simulator(MjcfEnvironment.build(XML, unknowns, ["motor"], ["joint:hinge.position"]), 1)
+    values = np.array([1.0, 0.08])
+    weighed = pendulum(unknowns[0])
+    logs = Trajectories.stack([log(weighed, [0.6, 0.08, 1.0], s, name=str(s)) for s in (2, 3)])
+    windows = Windows(Segments(0.5), simulator, logs)
+    seen = ProbedLogs(windows, simulator.space.normalise(values), Noise(np.array([0.01]), np.zeros(1)))
+    (opened,) = untold(seen, Tolerances(geometry=0.05))
+    np.testing.assert_allclose(simulator.space.values(seen.theta + opened.shift) - values, 0.05 * values, rtol=0.1)
+    assert opened.sentence == "a mass of rod that is 5 % off"
+    assert untold(seen, Tolerances(timing=0.05)) == []  # there is nothing that comes late for it
+
+
+def test_what_a_measurement_is_taken_later_the_delay_of_the_commands_is_shorter() -> None:
+    simulator = pendulum(Parameter("delay", 0.0, 0.05, targets=("actuator:motor.delay",)))
+    values = np.array([0.6, 0.08, 0.02])
+    logs = Trajectories.stack([log(simulator, values.tolist(), seed, name=str(seed)) for seed in (2, 3)])
+    windows = Windows(Segments(0.5), simulator, logs)
+    seen = ProbedLogs(windows, simulator.space.normalise(values), Noise(np.array([0.01]), np.zeros(1)))
+    (opened,) = untold(seen, Tolerances(timing=0.05))
+    late = 0.05 * float(logs.dt[0])
+    np.testing.assert_allclose(simulator.space.values(seen.theta + opened.shift)[2] - 0.02, -late, rtol=0.1)
+    assert opened.sentence.endswith("that is taken 5 % of a sample off")

@@ -19,6 +19,14 @@ class Mass(Extension):
         """What it is."""
         return f"a mass of {site} that is not the model's"
 
+    def wholes(self, machine: Machine, site: str) -> tuple[float, ...]:
+        """All of it."""
+        return (machine.bodies[site].mass,)
+
+    def off(self, site: str, share: float) -> str:
+        """See ``Extension``."""
+        return f"a mass of {site} that is {100 * share:.3g} % off"
+
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """The mass, with a normal prior around the model's; none of a body whose mass or inertia is unknown already."""
         head, own = f"body:{site}.", machine.bodies[site].mass

@@ -42,6 +42,14 @@ class SensorDelay(Extension):
             ),
         )
 
+    def wholes(self, machine: Machine, site: str) -> tuple[float, ...]:
+        """From sample to sample."""
+        return (machine.dt,)
+
+    def off(self, site: str, share: float) -> str:
+        """See ``Extension``."""
+        return f"a measurement {_short(site)} that is taken {100 * share:.3g} % of a sample off"
+
     def memory(self, dt: float) -> float:
         """The longest delay."""
         return min(0.1, 20 * dt)
