@@ -134,7 +134,8 @@ def counts_of(scales: Sequence[Scale]) -> tuple[Scale, ...]:
 
 
 def _matched(match: Match) -> tuple[str, ...]:
-    return () if match.sure else (f"taken for {match.target} by the order of names alone",)
+    how = "for the nearest name" if match.named else "by the order of names alone"
+    return () if match.sure else (f"taken for {match.target} {how}",)
 
 
 def _by_velocity(reading: Reading, matches: Matches, table: Table, clock: Clock) -> Reading:
