@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 
-from sipe_bayes.calibration.clipping import SATURATION, Signal, clipped_of
+from sipe_bayes.calibration.checks.clipping import SATURATION, Signal, clipped_of
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_tables import LogEntry, Measurement
 from sipe_bayes.calibration.grid import Grid, Recording, Series, gaps

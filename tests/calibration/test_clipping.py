@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sipe_bayes.calibration.clipping import Signal, clipped_of
+from sipe_bayes.calibration.checks.clipping import Signal, clipped_of
 from sipe_bayes.calibration.gathered import of_logs
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Severity, finding
@@ -72,7 +72,7 @@ def test_what_is_flat_while_the_other_moves_on_is_cut_off(name: str, rate: float
 
 
 def test_without_a_set_point_the_rest_of_the_machine_tells() -> None:
-    time, signals = arm(3)
+    time, _ = arm(3)
     flat = np.minimum(np.sin(2.0 * time), 0.7)
     alone = clipped_of([Signal("q", time, flat, False)])["q"]
     assert alone > 0.1 * len(time), "where nothing is beside it, nothing tells that it rests"
