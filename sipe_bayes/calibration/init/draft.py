@@ -23,6 +23,7 @@ Row = dict[str, object]
 
 _FLOWN = 2.0  # against unlikely units of what thrust moves: the smaller a motion is read, the better all fits
 _UNLIKELY = 0.01  # of the logarithm of misses, by which what is not likely has to be better
+_CUSTOM = float(np.log(1.5))  # against units where a kind of log usually has a share of the joint's range
 _TURNED = float(np.log(2.0))  # and a sign that a gyro speaks against, which may be mounted otherwise
 
 
@@ -317,8 +318,10 @@ def questions(draft: Draft, machine: Machine) -> list[Question]:
             against = _TURNED if reading.turning else _UNLIKELY
             signs.append(Question((k,), (reading.sign, turned(reading.sign)), against))
     flown = any(actuator.thrust for actuator in machine.actuators)
+    usual = _FLOWN if flown else _UNLIKELY
     units = [
-        Question(tuple(members), scales, _FLOWN if flown else _UNLIKELY) for (_, scales), members in groups.items()
+        Question(tuple(members), scales, _CUSTOM if scales[0].ends else usual)
+        for (_, scales), members in groups.items()
     ]
     return units + signs
 
