@@ -21,7 +21,8 @@ from sipe_bayes.calibration.init.write import summary, toml_of
 from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.core.arrays import FloatArray
 
-ARM = """<mujoco><compiler angle="radian"/><option timestep="0.01" integrator="implicitfast"/><worldbody><body name="upper">
+ARM = """<mujoco><compiler angle="radian"/><option timestep="0.01" integrator="implicitfast"/>
+  <worldbody><body name="upper">
   <joint name="elbow" axis="0 1 0" range="-1.2 1.2" damping=".05"/>
   <geom type="capsule" fromto="0 0 0 0 0 -.2" size=".01" mass=".2"/>
   <body name="jaw" pos="0 0 -.2"><joint name="gripper" {jaw} damping=".02"/>
