@@ -235,7 +235,7 @@ def of_logs(reports: Sequence[LogReport]) -> list[Finding]:
 
 
 def _clipped(reports: Sequence[LogReport]) -> list[Finding]:
-    """What is stuck at extreme values, one of each channel."""
+    """What is stuck at extreme values, one of each channel, which stands for the first of its logs."""
     noticed = [(report, note) for report in reports for note in report.findings if note.code is Code.LOG_CLIPPED]
     out = []
     for channel in dict.fromkeys(channel for report in reports for channel in report.clipped):
@@ -244,7 +244,7 @@ def _clipped(reports: Sequence[LogReport]) -> list[Finding]:
             continue
         names = [report.name for report, _ in alike]
         count = sum(report.clipped[channel] for report, _ in alike)
-        total = finding(Code.LOG_CLIPPED, channel=channel, clipped=count, log=names[0] if len(names) == 1 else None)
+        total = finding(Code.LOG_CLIPPED, channel=channel, clipped=count, log=names[0])
         more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
         where = f"log{'s' * (len(names) > 1)} {', '.join(names[:_NAMED])}{more}"
         out.append(replace(total, text=f"{where}: {total.text}", severity=Severity.CAUTION))

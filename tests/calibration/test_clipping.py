@@ -10,7 +10,7 @@ import pytest
 from sipe_bayes.calibration.checks.clipping import Signal, clipped_of
 from sipe_bayes.calibration.gathered import of_logs
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.findings import Code, Severity, finding
+from sipe_bayes.core.findings import Code, Findings, Severity, finding
 from sipe_bayes.diagnostics.records import LogReport
 
 COUNT = 2 * np.pi / 4096
@@ -94,3 +94,4 @@ def test_what_several_logs_say_of_a_channel_is_one_line() -> None:
         "log run2: w: 7 samples stuck at an extreme value, perhaps saturated",
     ]
     assert {item.severity for item in noticed} == {Severity.CAUTION}
+    assert Findings(noticed).kinds == [f"{noticed[0].text} (and so 1 more)"], "one line on the terminal"
