@@ -37,7 +37,7 @@ def report_of(
     finite = np.isfinite(trajectory.observations)
     measured = zip(_column_names(config), config.sources, raw.measurements, strict=True)
     # a quaternion has length one: where a body rests or lies squarely, a component is at its largest
-    signals = [Signal(name, y.time, y.values, False) for name, (m, _), y in measured if not m.quaternion]
+    signals = [Signal(name, y.time, y.values, False, not m.quaternion) for name, (m, _), y in measured]
     signals += [Signal(c.target, y.time, y.values, True) for c, y in zip(config.drives, raw.commands, strict=True)]
     every = {name: _every(finite[:, j]) for j, name in enumerate(config.channels)}
     expected = {name: len(finite) // n for name, n in every.items()}

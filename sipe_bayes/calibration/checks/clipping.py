@@ -8,7 +8,7 @@ still as well, it rests, as in the pauses of an arm that is led by hand.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,18 +38,25 @@ _LOOKED_AT = 50  # windows of a run
 
 @dataclass(frozen=True)
 class Signal:
-    """A command or a measurement: seconds (n,) and values (n,), of which some may be missing."""
+    """A command or a measurement: seconds (n,) and values (n,), of which some may be missing.
+
+    counted: False for what only tells whether others rest.
+    """
 
     name: str
     time: FloatArray
     values: FloatArray
     command: bool
+    counted: bool = True
 
 
 def clipped_of(signals: Sequence[Signal]) -> dict[str, int]:
     """Samples of each signal of a log that are cut off."""
-    known = [Signal(s.name, s.time[ok], s.values[ok], s.command) for s in signals for ok in (np.isfinite(s.values),)]
-    return {s.name: count_clipped(s.values, s.command, _Rests(s, known)) for s in known}
+    known = []
+    for signal in signals:
+        ok = np.isfinite(signal.values)
+        known.append(replace(signal, time=signal.time[ok], values=signal.values[ok]))
+    return {s.name: count_clipped(s.values, s.command, _Rests(s, known)) for s in known if s.counted}
 
 
 def count_clipped(
@@ -102,7 +109,7 @@ class _Rests:
 
     def __init__(self, signal: Signal, signals: Sequence[Signal]) -> None:
         self._signal = signal
-        self._others = [s for s in signals if s.name != signal.name and len(s.time) > 1]
+        self._others = [s for s in signals if s is not signal and len(s.time) > 1 and np.ptp(s.values)]
         self._beside: FloatArray | None = None  # (m, n): what tells a rest
         self._tolerance = np.zeros(0)
         self._late = 0
