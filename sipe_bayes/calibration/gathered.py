@@ -30,6 +30,7 @@ from sipe_bayes.simulation.simulator import Simulator
 
 _FREE = 0  # mjJNT_FREE
 _DRAWS = 4000  # of the posterior: quantiles to one or two percent of an sd
+_NAMED = 3  # logs of what is summed up
 
 
 def most_probable(posterior: Posterior) -> FloatArray:
@@ -229,4 +230,22 @@ def of_logs(reports: Sequence[LogReport]) -> list[Finding]:
         replace(note, text=f"log {report.name}: {note.text}", severity=_of_log(report, note))
         for report in reports
         for note in report.findings
-    ]
+        if note.code is not Code.LOG_CLIPPED
+    ] + _clipped(reports)
+
+
+def _clipped(reports: Sequence[LogReport]) -> list[Finding]:
+    """What is stuck at extreme values, one of each channel, which stands for the first of its logs."""
+    noticed = [(report, note) for report in reports for note in report.findings if note.code is Code.LOG_CLIPPED]
+    out = []
+    for channel in dict.fromkeys(channel for report in reports for channel in report.clipped):
+        alike = [(report, note) for report, note in noticed if note.text.startswith(f"{channel}: ")]
+        if not alike:
+            continue
+        names = [report.name for report, _ in alike]
+        count = sum(report.clipped[channel] for report, _ in alike)
+        total = finding(Code.LOG_CLIPPED, channel=channel, clipped=count, log=names[0])
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        where = f"log{'s' * (len(names) > 1)} {', '.join(names[:_NAMED])}{more}"
+        out.append(replace(total, text=f"{where}: {total.text}", severity=Severity.CAUTION))
+    return out

@@ -3,33 +3,20 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 
 import numpy as np
 
+from sipe_bayes.calibration.checks.clipping import SATURATION, Signal, clipped_of
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_tables import LogEntry, Measurement
 from sipe_bayes.calibration.grid import Grid, Recording, Series, gaps
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
-from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.diagnostics.records import LogReport
 from sipe_bayes.likelihood.wild_samples import jumps
 
-
-@dataclass(frozen=True)
-class Saturation(Options):
-    """When samples at an extreme value count as cut off."""
-
-    run: int = option(5, "in a row at the extreme value", "samples", least=2)
-    share: float = option(0.01, "worth a note: dry friction holds a turning joint for a few", "of the samples", above=0)
-    levels: int = option(10, "different values: a signal with fewer is switched, not clipped", least=2)
-    quanta: float = option(2.5, "from as far it was cut off, from nearer it turned round", "smallest steps", above=0)
-
-
-_SATURATION = Saturation()
 _EVEN, _FEWEST = 0.95, 10  # share of a slower sensor's samples that are as far apart as usual; and how many it has
 _SILENT = 10.0  # periods of a command after its last one: a stream that has stopped, and no late message
 
@@ -50,14 +37,13 @@ def report_of(
     finite = np.isfinite(trajectory.observations)
     measured = zip(_column_names(config), config.sources, raw.measurements, strict=True)
     # a quaternion has length one: where a body rests or lies squarely, a component is at its largest
-    signals = {name: y.values for name, (m, _), y in measured if not m.quaternion}
-    signals |= {c.target: y.values for c, y in zip(config.drives, raw.commands, strict=True)}
+    signals = [Signal(name, y.time, y.values, False, not m.quaternion) for name, (m, _), y in measured]
+    signals += [Signal(c.target, y.time, y.values, True) for c, y in zip(config.drives, raw.commands, strict=True)]
     every = {name: _every(finite[:, j]) for j, name in enumerate(config.channels)}
     expected = {name: len(finite) // n for name, n in every.items()}
     missing = {name: max(expected[name] - int(finite[:, j].sum()), 0) for j, name in enumerate(config.channels)}
-    driven = {command.target for command in config.drives}
-    clipped = {name: count_clipped(values, name in driven) for name, values in signals.items()}
-    saturated = {name: n for name, n in clipped.items() if n > _SATURATION.share * len(raw.time)}
+    clipped = clipped_of(signals)
+    saturated = {name: n for name, n in clipped.items() if n > SATURATION.share * len(raw.time)}
     commands = zip(config.drives, raw.commands, strict=True)
     blank = {c.target: int((~np.isfinite(y.values[:-1])).sum()) for c, y in commands}
     holes = gaps(np.any(finite, axis=-1), grid.dt, config.resample.max_gap)
@@ -159,29 +145,3 @@ def _jitter(time: FloatArray) -> float:
     periods = np.diff(time)
     median = np.median(periods)
     return float(np.abs(periods - median * np.maximum(1.0, np.round(periods / median))).max())
-
-
-def count_clipped(values: FloatArray, command: bool = False) -> int:
-    """Samples of a signal (n,) stuck at its largest or smallest value, in runs of five or more.
-
-    A quantised signal that rests or turns there also repeats itself; clipping cuts off a moving one. So a run
-    counts only if two samples before or after it the signal is at least three quanta away, a quantum being
-    its smallest step. Switched and constant signals have none, and a command that is 0 there rests: an idle rotor.
-    """
-    values = values[np.isfinite(values)]
-    if len(np.unique(values)) < _SATURATION.levels:
-        return 0
-    low, high = float(values.min()), float(values.max())
-    steps = np.abs(np.diff(values))
-    far = _SATURATION.quanta * float(steps[steps > 1e-6 * (high - low)].min())
-    return sum(_stuck(values, extreme, far) for extreme in (low, high) if extreme or not command)
-
-
-def _stuck(values: FloatArray, extreme: float, far: float) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], values == extreme, [False]]).astype(np.int8)))
-    away = np.concatenate([[0.0, 0.0], np.abs(values - extreme), [0.0, 0.0]])
-    return sum(
-        int(stop - start)
-        for start, stop in zip(edges[::2], edges[1::2], strict=True)
-        if stop - start >= _SATURATION.run and max(away[start], away[stop + 3]) >= far
-    )

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from sipe_bayes.calibration.checks.clipping import count_clipped
 from sipe_bayes.calibration.checks.fitted import with_wild
 from sipe_bayes.calibration.config import load_config
 from sipe_bayes.calibration.config_fields import ConfigError
-from sipe_bayes.calibration.log_report import count_clipped
 from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.calibration.readers.base import LogError

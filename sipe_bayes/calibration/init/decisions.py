@@ -333,7 +333,9 @@ def _with_evidence(
     if rejected:
         _put(out, question, missing_more(answer, rejected), "", "")
     if rivals:
-        _put(out, question, "", as_well(answer, rivals), "\n".join(key for other, _ in rivals for key in other.keys))
+        _put(out, question, "", as_well(answer, rivals), "")
+        for k in question.readings:
+            out[k] = replace(out[k], instead=(*out[k].instead, *(y for x, _ in rivals for y in out[k].lines_of(x))))
     return out
 
 

@@ -23,22 +23,21 @@ Row = dict[str, object]
 
 _FLOWN = 2.0  # against unlikely units of what thrust moves: the smaller a motion is read, the better all fits
 _UNLIKELY = 0.01  # of the logarithm of misses, by which what is not likely has to be better
+_CUSTOM = float(np.log(1.5))  # against units where a kind of log usually has a share of the joint's range
 _TURNED = float(np.log(2.0))  # and a sign that a gyro speaks against, which may be mounted otherwise
 
 
 class Scale(NamedTuple):
-    """A unit word, and what a column is multiplied by beside it."""
+    """A unit word, and what a column is multiplied by beside it; or what it says at the ends of its joint's range."""
 
     unit: str
     factor: float = 1.0
+    ends: tuple[float, float] | None = None
 
     def __str__(self) -> str:
+        if self.ends:
+            return f"{self.ends[0]:g} to {self.ends[1]:g} of the joint's range"
         return self.unit if self.factor == 1 else f"{1 / self.factor:g} counts a {self.unit}"
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """Its lines in a configuration."""
-        return (f'unit = "{self.unit}"', *([f"factor = {self.factor!r}"] if self.factor != 1 else []))
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,10 @@ class Reading:
         unsure: SI, by how much that may be wrong where simulations alone tell it.
         wraps: whether jumps by a turn are taken out.
         fit: False for what only starts windows.
-        scales: what it may be besides units of its kind: counts.
+        scales: what it may be in place of units of its kind: counts.
+        shares: what it may be besides: shares of its joint's range.
+        reach: that range, rad or m.
+        ends: what the column says at the ends of it, where it is read so.
         supply: column of the voltage that a duty is a share of, and its unit.
         turning: the sign that a gyro speaks for; 0 where none does.
         notes: the evidence, each a comment.
@@ -71,6 +73,9 @@ class Reading:
     wraps: bool = False
     fit: bool = True
     scales: tuple[Scale, ...] = ()
+    shares: tuple[Scale, ...] = ()
+    reach: tuple[float, float] | None = None
+    ends: tuple[float, float] | None = None
     supply: tuple[str, str] | None = None
     turning: int = 0
     notes: tuple[str, ...] = ()
@@ -81,6 +86,42 @@ class Reading:
     def commanded(self) -> bool:
         """Whether it drives an actuator."""
         return self.match.target.startswith("actuator:")
+
+    @property
+    def scale(self) -> Scale:
+        """What it is read as."""
+        return Scale(self.unit, 1.0, self.ends) if self.ends else Scale(self.unit, self.factor)
+
+    def read_as(self, scale: Scale) -> Reading:
+        """With another scale, which has a zero of its own where it is a share of the joint's range."""
+        if scale.ends is None or self.reach is None:
+            zero = 0.0 if self.ends else self.zero
+            return replace(self, unit=scale.unit, factor=scale.factor, zero=zero, ends=None)
+        if scale.ends == self.ends:
+            return self
+        factor = (self.reach[1] - self.reach[0]) / (scale.ends[1] - scale.ends[0])
+        read = replace(self, unit=scale.unit, factor=float(f"{factor:.6g}"), ends=scale.ends)
+        return replace(read, zero=read.zero_with(self.sign))
+
+    def zero_with(self, sign: int) -> float:
+        """What the column says where the model has 0, with a sign, where it is a share of the joint's range."""
+        if self.ends is None or self.reach is None:
+            return self.zero
+        size = (self.reach[1] - self.reach[0]) / (self.ends[1] - self.ends[0])
+        begin = self.reach[0] if sign > 0 else -self.reach[1]
+        return float(f"{self.ends[0] - begin / size:.6g}")
+
+    def turned_to(self, sign: int) -> Reading:
+        """With a sign, and the other end of the joint's range first where it counts from an end."""
+        own = self.zero == self.zero_with(self.sign)
+        return replace(self, sign=sign, zero=self.zero_with(sign) if own else self.zero)
+
+    def lines_of(self, scale: Scale) -> tuple[str, ...]:
+        """Lines of TOML that stand in a configuration for another scale."""
+        other = self.read_as(scale)
+        unit = f'unit = "{scale.unit}"' + "  # and no factor, no zero" * bool(self.ends and not other.ends)
+        factor = [f"factor = {other.factor!r}"] if other.factor != 1 else []
+        return unit, *factor, *([f"zero = {other.zero!r}"] if other.ends else [])
 
     def row(self) -> Row:
         """Its table in the configuration."""
@@ -269,15 +310,18 @@ def questions(draft: Draft, machine: Machine) -> list[Question]:
         if not is_tried(draft, reading):
             continue
         scales = _scales(reading, machine)
-        if not reading.match.label.unit and len(scales) > 1 and (reading.factor == 1 or reading.scales):
-            own = "command" if reading.commanded else "measured"
+        open_scales = reading.factor == 1 or reading.scales or reading.shares
+        if not reading.match.label.unit and len(scales) > 1 and open_scales:
+            own = "both" if reading.shares else "command" if reading.commanded else "measured"
             groups.setdefault((own, scales), []).append(k)
         if len(reading.match.columns) == 1 and reading.match.target not in one_way:
             against = _TURNED if reading.turning else _UNLIKELY
             signs.append(Question((k,), (reading.sign, turned(reading.sign)), against))
     flown = any(actuator.thrust for actuator in machine.actuators)
+    usual = _FLOWN if flown else _UNLIKELY
     units = [
-        Question(tuple(members), scales, _FLOWN if flown else _UNLIKELY) for (_, scales), members in groups.items()
+        Question(tuple(members), scales, _CUSTOM if scales[0].ends else usual)
+        for (_, scales), members in groups.items()
     ]
     return units + signs
 
@@ -285,7 +329,9 @@ def questions(draft: Draft, machine: Machine) -> list[Question]:
 def _scales(reading: Reading, machine: Machine) -> tuple[Scale, ...]:
     """What a column may be multiplied by, first what the draft has."""
     scales = reading.scales or tuple(Scale(word) for word in unit_words(reading, machine))
-    return tuple(sorted(scales, key=lambda scale: scale != (reading.unit, reading.factor)))
+    if reading.ends or not reading.zero:  # a zero that simulations tell is no share's
+        scales = (*scales, *reading.shares)
+    return tuple(sorted(scales, key=lambda scale: scale != reading.scale))
 
 
 def is_tried(draft: Draft, reading: Reading) -> bool:
@@ -309,6 +355,5 @@ def answered(readings: Sequence[Reading], asked: Sequence[Question], answers: Se
     out = list(readings)
     for question, answer in zip(asked, answers, strict=True):
         for k in question.readings:
-            now = {"sign": answer} if isinstance(answer, int) else {"unit": answer.unit, "factor": answer.factor}
-            out[k] = replace(out[k], **now)
+            out[k] = out[k].turned_to(answer) if isinstance(answer, int) else out[k].read_as(answer)
     return tuple(out)

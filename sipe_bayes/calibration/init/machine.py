@@ -36,7 +36,7 @@ _INPUTS = {
 class Joint:
     """A hinge or slide and its body; rank: its place among these; base: whether it only says where an undriven base is.
 
-    Such a joint has no bearing and no gears: see ``base_joints``.
+    Such a joint has no bearing and no gears: see ``base_joints``. reach: its range, rad or m; None where it has none.
     """
 
     name: str
@@ -44,6 +44,7 @@ class Joint:
     hinge: bool
     rank: int
     base: bool = False
+    reach: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,7 @@ class Machine:
                 int(model.jnt_type[i]) == scalar[0],
                 k,
                 i in of_base,
+                (float(model.jnt_range[i, 0]), float(model.jnt_range[i, 1])) if model.jnt_limited[i] else None,
             )
             for k, i in enumerate(named)
         ]

@@ -12,6 +12,7 @@ from sipe_bayes.calibration.init.columns.names import Kind, pieces_of, read_name
 from sipe_bayes.calibration.init.columns.signals import Slope, likeness, slope_of, turn_of, white_share
 from sipe_bayes.calibration.init.draft import Reading, Scale
 from sipe_bayes.calibration.init.machine import Actuator, Drive, Machine
+from sipe_bayes.calibration.init.shares import with_shares
 from sipe_bayes.calibration.init.tables import Clock
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.units import find_unit, unit_words
@@ -66,6 +67,7 @@ def first_readings(
     drives = {f"actuator:{actuator.name}": actuator for actuator in machine.actuators}
     commands = [_command(drives[m.target], m, matches, table) for m in matches.commands]
     commands = [_on_its_side(reading, drives[reading.match.target], table) for reading in commands]
+    positions, commands = with_shares(positions, commands, machine, table)
     return (*positions, *velocities, *vectors), tuple(commands)
 
 
@@ -134,7 +136,8 @@ def counts_of(scales: Sequence[Scale]) -> tuple[Scale, ...]:
 
 
 def _matched(match: Match) -> tuple[str, ...]:
-    return () if match.sure else (f"taken for {match.target} by the order of names alone",)
+    how = "for the nearest name" if match.named else "by the order of names alone"
+    return () if match.sure else (f"taken for {match.target} {how}",)
 
 
 def _by_velocity(reading: Reading, matches: Matches, table: Table, clock: Clock) -> Reading:

@@ -48,10 +48,19 @@ def _open(doubt: str) -> str:
 
 def _reading(table: str, reading: Reading) -> str:
     """A command or measurement: evidence, what is open, its keys, and what would stand there instead."""
-    lines = [_comment(note) for note in reading.notes] + [_open(doubt) for doubt in reading.doubts]
+    lines = [_comment(note) for note in (*reading.notes, *_of_range(reading))]
+    lines += [_open(doubt) for doubt in reading.doubts]
     body = to_toml({table: [reading.row()]}).rstrip("\n")
     instead = [f"# {printed(line)}" for line in reading.instead]
     return "\n".join([*lines, body, *instead]) + "\n"
+
+
+def _of_range(reading: Reading) -> list[str]:
+    """What a share of a joint's range is."""
+    if reading.ends is None or reading.reach is None:
+        return []
+    (low, high), (first, last) = reading.reach, reading.ends if reading.sign > 0 else reading.ends[::-1]
+    return [f"a share of the joint's range: {first:g} at {low:g} {reading.unit}, {last:g} at {high:g} {reading.unit}"]
 
 
 def _unknown(unknown: Unknown) -> str:
@@ -86,7 +95,8 @@ def summary(draft: Draft, path: str) -> list[str]:
 def _said(reading: Reading) -> str:
     columns = ", ".join(reading.match.columns)
     sign = "-" if reading.sign < 0 else ""
-    unit = f"quaternion {reading.match.quaternion}" if reading.match.quaternion else f"{sign}{reading.unit}"
+    word = str(reading.scale) if reading.ends else reading.unit
+    unit = f"quaternion {reading.match.quaternion}" if reading.match.quaternion else f"{sign}{word}"
     extra = f", zero {reading.zero:.4g}" * bool(reading.zero) + ", wraps" * reading.wraps
     extra += ", starts windows only" * (not reading.fit)
     return _short(f"{reading.match.target} <- {columns} [{unit}]{extra}")

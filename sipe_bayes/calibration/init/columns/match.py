@@ -12,13 +12,14 @@ SURE = 1.0
 
 @dataclass(frozen=True)
 class Match:
-    """Columns that are taken for a quantity of the model; score: how well the names agree."""
+    """Columns that are taken for a quantity of the model; score: how well the names agree; named: whether any does."""
 
     columns: tuple[str, ...]
     target: str
     label: Label
     score: float
     quaternion: str = ""
+    named: bool = False
 
     @property
     def column(self) -> str:

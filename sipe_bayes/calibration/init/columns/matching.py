@@ -10,7 +10,16 @@ import numpy as np
 import scipy.optimize
 
 from sipe_bayes.calibration.init.columns.match import SURE, Match, Matches
-from sipe_bayes.calibration.init.columns.names import OF_BODIES, Kind, Label, alike, number_of, pieces_of, read_name
+from sipe_bayes.calibration.init.columns.names import (
+    OF_BODIES,
+    Kind,
+    Label,
+    alike,
+    is_exactly,
+    number_of,
+    pieces_of,
+    read_name,
+)
 from sipe_bayes.calibration.init.columns.signals import slope_of
 from sipe_bayes.calibration.init.columns.vectors import held_open, match_vectors
 from sipe_bayes.calibration.init.machine import Actuator, Drive, Joint, Machine
@@ -20,6 +29,7 @@ Table = Mapping[str, FloatArray]
 Families = Mapping[str, list[Label]]
 
 _NEVER = -2.0
+_EXACTLY = 0.5  # for a column that has all words of a joint's name, over one that has those of another's body
 _CALLED = 0.65  # how alike a column and a joint are, from which it is called after it
 _BACK = 0.01  # of its steps, from which a column that goes back is no clock
 _RIVAL = 3.0  # by which a column for a command may fit worse than the chosen one and still be named
@@ -103,7 +113,7 @@ def _of_joint(label: Label, joint: Joint, place: int | None, count: int) -> floa
     own, body = (
         _affinity(label, name, joint.rank, joint.hinge, place, count) for name in (joint.name, joint.body or joint.name)
     )
-    return max(own, body - 0.1)
+    return max(own + _EXACTLY * is_exactly(label, joint.name), body - 0.1)
 
 
 def _solved(scores: FloatArray) -> list[tuple[int, int]]:
@@ -122,16 +132,24 @@ def _assigned(joints: Sequence[Joint], labels: Sequence[Label], kind: Kind, plac
     word = {Kind.POSITION: "position", Kind.TORQUE: "force"}.get(kind, "velocity")
     alone = len(labels) == len(joints) == 1
     pairs = sorted(_solved(scores), key=lambda pair: pair[1])
+    names = [joint.name for joint in joints]
     return [
-        Match((labels[i].column,), f"joint:{joints[j].name}.{word}", labels[i], _surety(scores, i, j, alone))
+        Match(
+            (labels[i].column,), f"joint:{names[j]}.{word}", labels[i],
+            SURE if alone or _only(labels[i], names, j) else _surety(scores, i, j),
+            named=max(alike(labels[i].words, names[j]), alike(labels[i].words, joints[j].body)) > 0,
+        )
         for i, j in pairs
-    ]
+    ]  # fmt: skip
 
 
-def _surety(scores: FloatArray, i: int, j: int, alone: bool) -> float:
+def _only(label: Label, names: Sequence[str], j: int) -> bool:
+    """Whether a column is called exactly as one of the names, and as no other."""
+    return [k for k, name in enumerate(names) if is_exactly(label, name)] == [j]
+
+
+def _surety(scores: FloatArray, i: int, j: int) -> float:
     """By how much a pair is better than the next best object for its column."""
-    if alone:
-        return SURE
     others = np.delete(scores[i], j)
     return float(min(scores[i, j], scores[i, j] - others.max()) if others.size else scores[i, j] + 0.5)
 
@@ -186,7 +204,8 @@ def _commands(machine: Machine, labels: Sequence[Label], places: Mapping[str, in
     scores = np.array([[score(x, a) for a in actuators] for x in labels])
     scores -= [[0.002 * k] for k in range(len(labels))]
     pairs = sorted(_solved(scores), key=lambda pair: pair[1])
-    alone = len(actuators) == 1
+    alone, names = len(actuators) == 1, [actuator.name for actuator in actuators]
+    moved = [actuator.joint.name if actuator.joint else "" for actuator in actuators]
     rest = [i for i, x in enumerate(labels) if x.commanded and i not in {i for i, _ in pairs}]
     undriven = sorted(set(range(len(actuators))) - {j for _, j in pairs})
     if len(rest) == len(undriven) == 1:  # whatever it is called
@@ -194,8 +213,10 @@ def _commands(machine: Machine, labels: Sequence[Label], places: Mapping[str, in
     commands, rivals = [], []
     for i, j in pairs:
         target = f"actuator:{actuators[j].name}"
-        surety = _surety(scores, i, j, False) if not alone else SURE
-        commands.append(Match((labels[i].column,), target, labels[i], surety))
+        exactly = _only(labels[i], names, j) or _only(labels[i], moved, j)
+        surety = SURE if alone or exactly else _surety(scores, i, j)
+        named = max(alike(labels[i].words, names[j]), alike(labels[i].words, moved[j])) > 0
+        commands.append(Match((labels[i].column,), target, labels[i], surety, named=named))
         for k in np.argsort(-scores[:, j]):
             free = k not in {i for i, _ in pairs}
             if free and scores[k, j] > max(scores[i, j] - _RIVAL, -0.5):

@@ -321,6 +321,18 @@ def _in_order(short: str, long: str) -> bool:
     return all(letter in letters for letter in short)
 
 
+def is_exactly(label: Label, name: str) -> bool:
+    """Whether a column is called as something of the model, but for words of its quantity and of the log's format."""
+    own = pieces_of(name)
+    numbers = {label.number} if label.number is not None else set[int]()
+    return (
+        bool(own)
+        and {*own} <= {*pieces_of(label.column)}
+        and {*label.words} <= {*own}
+        and numbers <= {int(piece) for piece in own if piece.isdigit()}
+    )
+
+
 def number_of(name: str) -> int | None:
     """The last number in a name of the model."""
     numbers = re.findall(r"\d+", name)

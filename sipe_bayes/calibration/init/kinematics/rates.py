@@ -229,5 +229,6 @@ def _compared(reading: Reading, size: float, scales: Sequence[Scale], gyro: str)
         doubt = f"{now} or {names}? {says}, and {off}"
     if not doubt:
         return replace(reading, notes=(*reading.notes, f"{now}: {says}"))
-    instead = tuple(key for other in others for key in other.keys if key not in now.keys)
+    lines = reading.lines_of(now)
+    instead = tuple(line for other in others for line in reading.lines_of(other) if line not in lines)
     return replace(reading, doubts=(*reading.doubts, doubt), instead=(*reading.instead, *instead))

@@ -174,3 +174,36 @@ def test_ticks_that_go_back_are_a_joints_and_no_clock() -> None:
     table = {"u": rows, "beam_ticks": np.round(100 * np.sin(rows)), "ball_mm": rows}
     assert [m.column for m in match_columns(machine, table).positions] == ["beam_ticks", "ball_mm"]
     assert [m.column for m in match_columns(machine, {**table, "beam_ticks": rows}).positions] == ["ball_mm"]
+
+
+ARM = """<mujoco><worldbody><body name="shoulder"><joint name="shoulder_pan"/><geom size=".1" mass="1"/>
+<body name="upper_arm"><joint name="shoulder_lift"/><geom size=".1" mass="1"/>
+<body name="hand"><joint name="wrist_roll"/><geom size=".1" mass="1"/>
+<body name="jaw"><joint name="gripper"/><geom size=".1" mass="1"/></body></body></body></body></worldbody>
+<actuator><position name="a" joint="shoulder_pan"/><position name="b" joint="shoulder_lift"/>
+<position name="c" joint="wrist_roll"/><position name="d" joint="gripper"/></actuator></mujoco>"""
+JOINTS = ("shoulder_pan", "shoulder_lift", "wrist_roll", "gripper")
+
+
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("form", ["{}[{}.pos]", "{}.{}.pos", "{}_{}"])
+def test_a_name_that_is_the_joints_own_is_sure_whatever_a_body_is_called(form: str, order: int) -> None:
+    machine = Machine.of(mujoco.MjModel.from_xml_string(ARM))
+    columns = [form.format(of, joint) for of in ("observation.state", "action") for joint in JOINTS]
+    matches = matched(machine, columns[::order])
+    for match, of, joint in zip(
+        (*matches.positions, *matches.commands), ["observation.state"] * 4 + ["action"] * 4, JOINTS * 2, strict=True
+    ):
+        print(match.target, match.columns, match.score)
+        assert match.sure
+        assert match.column == form.format(of, joint)
+
+
+def test_only_what_nothing_names_is_taken_by_order() -> None:
+    machine = Machine.of(mujoco.MjModel.from_xml_string(ARM))
+    by_order = matched(machine, ["q_1", "q_2", "q_3", "q_4"]).positions
+    assert [match.named for match in by_order] == [False] * 4
+    near = {
+        m.target: m for m in matched(machine, [f"{name}_pos" for name in ("shoulder", "arm", "roll", "grip")]).positions
+    }
+    assert all(match.named for match in near.values())
