@@ -49,7 +49,7 @@ class Tolerances:
 
 
 EXACT = Tolerances()
-COMMANDS, GEOMETRY, TIMING = 0.1, 0.05, 0.05  # the usual sds: of motor constants, drawings, and loops that read joints
+COMMANDS, GEOMETRY, TIMING = 0.1, 0.05, 0.1  # the usual sds: of motor constants, of drawings, of loops that read joints
 
 
 def usual(actuators: Sequence[str]) -> Tolerances:
