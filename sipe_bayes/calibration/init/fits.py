@@ -139,8 +139,18 @@ def fit(
 
 def _windows(trial: Trial, delays: int, afforded: int) -> int:
     """Windows of a fit: the more parameters and starts there are, the more simulations each of them takes."""
+    return max(_FEWEST, int(afforded / _steps_of_window(trial, delays)))
+
+
+def fit_steps(trial: Trial, delays: int, afforded: int) -> float:
+    """Physics steps of a round of a fit at so many delays."""
+    windows = min(_windows(trial, delays, afforded), sum(map(len, trial.places)))
+    return windows * _steps_of_window(trial, delays)
+
+
+def _steps_of_window(trial: Trial, delays: int) -> float:
     each = delays + len(trial.theta) + 2 * trial.simulator.model.nv
-    return max(_FEWEST, int(afforded / (each * trial.steps / sum(map(len, trial.places)))))
+    return each * trial.steps / sum(map(len, trial.places))
 
 
 def _descended(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sipe_bayes.calibration.init.draft import Answer, Draft, Question, Reading, Scale, answered, questions, turned
-from sipe_bayes.calibration.init.fits import fit
+from sipe_bayes.calibration.init.fits import fit, fit_steps
 from sipe_bayes.calibration.init.machine import Machine
 from sipe_bayes.calibration.init.trials import Assumption, Trial, followed
 from sipe_bayes.core.arrays import FloatArray
@@ -27,6 +27,7 @@ _BELIEVED = 0.3  # up to which it decides
 _FAR = np.log(4.0)  # behind the best, up to which combinations are fitted
 _SAME = np.log(1.02)
 _FITTED = 4  # units, and combinations of signs with each, that are fitted where the nominal model does not decide
+_FITS, _FIT = 100_000_000, 100_000  # steps times degrees of freedom of all of these: two minutes; steps of a round
 _CLOSE = 12  # combinations of signs that are fitted of those between which it does not decide
 _FIRST_DELAYS = (0, 1, 2, 4)
 
@@ -320,7 +321,7 @@ def rivals_of(ranking: Ranking) -> list[int]:
     groups = list(units.values())
     close = sorted({*close} & {*groups[0]}, key=lambda i: len(ranking.changed(i, ranking.answers[best])))
     some = [i for same in groups[:_FITTED] for i in same[:_FITTED]]
-    return list(dict.fromkeys([*some, *close[:_CLOSE]]))
+    return list(dict.fromkeys([best, *close[:_CLOSE], *some]))
 
 
 def fitted(
@@ -328,8 +329,12 @@ def fitted(
 ) -> tuple[Ranking, FloatArray]:
     """The ranking with the model's unknowns fitted to the rivals, and these of the best.
 
-    The others stay as far behind the worst of the rivals as they were.
+    The others stay as far behind the worst of the rivals as they were, and rivals for which there is no time behind the
+    best: what the model as given does not tell of them stays open.
     """
+    trial = case.trial
+    most = max(2, int(_FITS / (6 * fit_steps(trial, len(_FIRST_DELAYS), _FIT) * trial.simulator.model.nv)))
+    rivals, late = rivals[:most], rivals[most:]
     scores, thetas, misses = [], [], []
     for k, i in enumerate(rivals):
         case.tell(f"{k} of {len(rivals)} of them with unknowns fitted")
@@ -341,9 +346,12 @@ def fitted(
     worst, rest = int(np.argmax(scores)), [i for i in range(len(ranking.answers)) if i not in rivals]
     shifted = ranking.scores[rest] + max(scores) - float(ranking.scores[list(rivals)].max())
     as_far = ranking.misses[rest] * misses[worst] / ranking.misses[rivals[worst]]
+    first, behind = int(np.argmin(scores)), [k for k, i in enumerate(rest) if i in late]
+    shifted[behind] = ranking.scores[[rest[k] for k in behind]] + min(scores) - float(ranking.scores[rivals[first]])
+    as_far[behind] = ranking.misses[[rest[k] for k in behind]] * misses[first] / ranking.misses[rivals[first]]
     answers = [ranking.answers[i] for i in (*rivals, *rest)]
     all_scores, all_misses = np.array([*scores, *shifted.tolist()]), np.array([*misses, *as_far])
-    return Ranking(answers, all_scores, all_misses, DECIDED, None, ranking.left), thetas[int(np.argmin(scores))]
+    return Ranking(answers, all_scores, all_misses, DECIDED, None, ranking.left), thetas[first]
 
 
 def fitted_miss(trial: Trial, assumption: Assumption, rounds: int) -> tuple[float, FloatArray]:
@@ -356,5 +364,5 @@ def fitted_miss(trial: Trial, assumption: Assumption, rounds: int) -> tuple[floa
 
 
 def _fitted_misses(trial: Trial, assumption: Assumption, rounds: int) -> tuple[FloatArray, FloatArray]:
-    left = fit(trial, assumption, _FIRST_DELAYS, rounds)
+    left = fit(trial, assumption, _FIRST_DELAYS, rounds, afforded=_FIT)
     return trial.misses([replace(assumption, delay=left.best)], left.theta)[0], left.theta
