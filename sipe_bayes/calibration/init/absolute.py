@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from sipe_bayes.calibration.init.decisions import Case, Layout, ranked, scale_of
-from sipe_bayes.calibration.init.draft import Draft, Reading, answered, questions, turned
+from sipe_bayes.calibration.init.draft import Answer, Draft, Question, Reading, answered, questions, turned
 from sipe_bayes.calibration.init.fits import fit
 from sipe_bayes.calibration.init.machine import Drive, Joint, Machine
-from sipe_bayes.calibration.init.trials import Trial
+from sipe_bayes.calibration.init.ranking import Case, Ranking, are_few, ranked, scale_of, under
 from sipe_bayes.core.arrays import FloatArray
 
 _FAR_BETTER = np.log(2.0)  # of the logarithm of misses of all channels together
@@ -21,6 +20,8 @@ _BELIEVED = 0.3  # of the miss of one channel, up to which it has no zero that i
 _FITTED = 3  # zeros with which the unknowns are fitted, those that miss least
 _GRID, _FINER = 31, 9  # zeros that are tried over the range of a joint, and twice around the best
 _UNSURE = 2.0  # steps of the grid, by which a zero may be off that simulations alone tell
+_AFFORDED, _FEWER = 1_000_000, 12  # physics steps of all grids, about 20 s with a dozen joints; and windows beyond
+_FIT_AFFORDED = 170_000  # of a round of a fit
 _NONE = 1e-6  # rad or m
 
 Readings = Sequence[Reading]
@@ -43,8 +44,8 @@ class _Zero:
         return out
 
 
-def with_zeros(draft: Draft, model: mujoco.MjModel, machine: Machine, trial: Trial, layout: Layout) -> Draft:
-    """The draft with those zeros of joints' columns with which simulations follow the logs clearly better.
+def with_zeros(case: Case, model: mujoco.MjModel, ranking: Ranking | None) -> tuple[Draft, list[str]]:
+    """The draft with those zeros of joints' columns with which simulations follow the logs clearly better, and doubts.
 
     First what the model names (a body's place in the world, ``ref``, keyframes) is tried, then a grid over the joint's
     range where no simulation follows the logs well. The unknowns are fitted with and without a zero: a model that is
@@ -52,19 +53,20 @@ def with_zeros(draft: Draft, model: mujoco.MjModel, machine: Machine, trial: Tri
     Windows count alike, those with an impact too: contacts tell of a zero.
 
     Args:
-        draft: of the trial.
+        case: the draft and its windows.
         model: as given.
-        machine: what of it logs hold.
-        trial: windows of the logs.
-        layout: where the draft's readings are in it.
+        ranking: its units and signs; None where all are known.
     """
-    case = Case(draft, machine, trial, layout, trial.theta)
-    joints = {k: j for k, r in enumerate(draft.readings) for j in machine.joints if _measures(r, j)}
-    near, taken = _nearest(case), list[tuple[_Zero, float]]()
-    channels = len(trial.given.observed)
+    draft = case.draft
+    joints = {k: j for k, r in enumerate(draft.readings) for j in case.machine.joints if _measures(r, j)}
+    near, taken = _nearest(case, ranking), list[tuple[_Zero, float]]()
+    channels = len(case.trial.given.observed)
     now = min((_fitted(case, readings) for readings in near), key=lambda one: float(one.missed.mean()))
+    left: list[int] = []
     while joints:
-        best = _first_better(case, model, joints, near, now)
+        unlike = [k for k in joints if now.misses[case.layout.channels[k][0]] > _BELIEVED]
+        looked, left = _afforded(case, sorted(unlike, key=lambda k: -now.misses[case.layout.channels[k][0]]), near)
+        best = _first_better(case, model, joints, {k: joints[k] for k in looked}, near, now)
         if best is None:
             break
         zero, then = best
@@ -75,19 +77,34 @@ def with_zeros(draft: Draft, model: mujoco.MjModel, machine: Machine, trial: Tri
     for zero, times in taken:
         readings = _with_evidence(zero, times, readings, now.readings)
     measured = len(draft.measurements)
-    return replace(draft, measurements=tuple(readings[:measured]), commands=tuple(readings[measured:]))
+    columns = ", ".join(repr(draft.readings[k].match.column) for k in sorted(left))
+    doubts = [f"simulations miss much of {columns}: too many to look for the zeros of all of them"] if left else []
+    placed = replace(draft, measurements=tuple(readings[:measured]), commands=tuple(readings[measured:]))
+    return placed, doubts
+
+
+def _afforded(case: Case, joints: list[int], near: Sequence[Readings]) -> tuple[list[int], list[int]]:
+    """Joints whose zeros a grid is simulated for, and those for which there is no time."""
+    if _costs_little(case, joints, near):
+        return joints, []
+    count = max(1, _AFFORDED // (2 * (_GRID + 2 * _FINER) * case.trial.thinned(_FEWER).steps))
+    return joints[:count], joints[count:]
+
+
+def _costs_little(case: Case, joints: Sequence[int], near: Sequence[Readings]) -> bool:
+    """Whether grids of all the joints are simulated with all windows."""
+    return 2 * len(near) * len(joints) * (_GRID + 2 * _FINER) * case.trial.steps <= _AFFORDED
 
 
 def _measures(reading: Reading, joint: Joint) -> bool:
     return reading.match.target == f"joint:{joint.name}.position" and len(reading.match.columns) == 1
 
 
-def _nearest(case: Case) -> list[Readings]:
+def _nearest(case: Case, ranking: Ranking | None) -> list[Readings]:
     """The readings with the units and signs that miss least, and with those of the names."""
     asked = questions(case.draft, case.machine)
-    if not asked:
+    if ranking is None:
         return [case.draft.readings]
-    ranking = ranked(case, asked)
     best = answered(case.draft.readings, asked, ranking.answers[int(np.argmin(ranking.scores))])
     return [best, *([case.draft.readings] if best != case.draft.readings else [])]
 
@@ -107,7 +124,7 @@ class _Fitted:
 
 def _fitted(case: Case, readings: Readings) -> _Fitted:
     assumption = case.assumption(readings)
-    left = fit(case.trial, assumption, (0, 1, 2, 4), rounds=3)
+    left = fit(case.trial, assumption, (0, 1, 2, 4), 3, case.tell, _FIT_AFFORDED)
     late = replace(assumption, delay=left.best)
     nominal, fitted = case.trial.missed([late], case.trial.theta)[0], case.trial.missed([late], left.theta)[0]
     theta, missed = (case.trial.theta, nominal) if nominal.mean() < fitted.mean() else (left.theta, fitted)
@@ -115,14 +132,20 @@ def _fitted(case: Case, readings: Readings) -> _Fitted:
 
 
 def _first_better(
-    case: Case, model: mujoco.MjModel, joints: dict[int, Joint], near: Sequence[Readings], now: _Fitted
+    case: Case,
+    model: mujoco.MjModel,
+    joints: dict[int, Joint],
+    unlike: dict[int, Joint],
+    near: Sequence[Readings],
+    now: _Fitted,
 ) -> tuple[_Zero, _Fitted] | None:
     """The best zero of those named, else of the grids, that is clearly better."""
     cases = [case, replace(case, theta=now.theta)]
-    unlike = {k: joint for k, joint in joints.items() if now.misses[case.layout.channels[k][0]] > _BELIEVED}
-    for zeros_of, of in ((_named, joints), (_searched, unlike)):
+    searched = _searched if _costs_little(case, [*unlike], near) else _searched_soon
+    for zeros_of, of in ((_named, joints), (searched, unlike)):
         tried: list[tuple[float, _Zero, Readings]] = []
-        for k, joint in of.items():
+        for n, (k, joint) in enumerate(of.items()):
+            case.tell(f"{n} of {len(of)} joints")
             tried += [one for one in zeros_of(cases, model, k, joint, near) if one[0] < now.missed.mean()]
         tried = sorted(tried, key=lambda one: one[0])[:_FITTED]
         after = [(zero, _fitted(case, readings)) for _, zero, readings in tried]
@@ -196,6 +219,15 @@ def _searched(cases: Sequence[Case], model: mujoco.MjModel, k: int, joint: Joint
     return [min(best, key=lambda one: one[0])]
 
 
+def _searched_soon(
+    cases: Sequence[Case], model: mujoco.MjModel, k: int, joint: Joint, near: Sequence[Readings]
+) -> Tried:
+    """The same of few windows, and of the best units and signs alone."""
+    few = [replace(case, trial=case.trial.thinned(_FEWER)) for case in cases]
+    (_, zero, readings), *_ = _searched(few, model, k, joint, near[:1])
+    return [(float(_missed(cases[-1:], [readings])[0]), zero, readings)]
+
+
 def _places(case: Case, k: int, joint: Joint) -> list[tuple[int, ...]]:
     """A column alone, and with the set-point of its joint, which a servo counts from the same zero."""
     servos = [f"actuator:{a.name}" for a in case.machine.actuators if a.drive == Drive.POSITION and a.joint == joint]
@@ -221,33 +253,49 @@ def _with_evidence(zero: _Zero, times: float, readings: Readings, by: Readings) 
     return out
 
 
-def absolute_angles(draft: Draft, model: mujoco.MjModel, machine: Machine, trial: Trial, layout: Layout) -> list[str]:
+def absolute_angles(case: Case, model: mujoco.MjModel, ranking: Ranking | None) -> list[str]:
     """What is to be said of columns that simulations follow far better with the angle of the link before taken off.
 
-    Units and signs are tried anew for each, since with a wrong angle wrong ones may follow it best.
+    Only columns are asked that simulations do not follow well. Units and signs are tried anew for each, since with a
+    wrong angle wrong ones may follow it best: of all columns, where these are many of the two and what drives them.
 
     Args:
-        draft: of the trial.
+        case: the draft and its windows.
         model: as given.
-        machine: what of it logs hold.
-        trial: windows of the logs.
-        layout: where the draft's readings are in it.
+        ranking: its units and signs; None where all are known.
     """
+    if ranking is None:
+        return []
+    draft, machine, layout, doubts = case.draft, case.machine, case.layout, list[str]()
     channel = {r.match.target: layout.channels[k][0] for k, r in enumerate(draft.readings) if layout.channels[k]}
     column, asked = {r.match.target: r.match.column for r in draft.readings}, questions(draft, machine)
-    pairs = _chained(model, machine, channel) if asked else []
-    case, doubts = Case(draft, machine, trial, layout, trial.theta), []
-    base = float(ranked(case, asked).scores.min()) if pairs else 0.0
-    for own, before in pairs:
+    least = int(np.argmin(ranking.scores))
+    pairs = [p for p in _chained(model, machine, channel) if ranking.misses[least][channel[p[0]]] > _BELIEVED]
+    for k, (own, before) in enumerate(pairs):
         taken_off = replace(layout, minus=((channel[own], channel[before]),))
-        better = base - float(ranked(replace(case, layout=taken_off), asked).scores.min())
+        part = asked if are_few(asked) else _of_joints(case, asked, (own, before), ranking.answers[least])
+        counted = under(case.tell, f"link {k + 1} of {len(pairs)}")
+        tried = ranked(replace(case, layout=taken_off, tell=counted), part)
+        better = float(ranking.scores[least] - tried.scores.min())
         if better > _FAR_BETTER:
             doubts.append(
                 f"{column[own]!r} looks like the angle of a link against the world, not of a joint: with "
-                f"{column[before]!r} taken off, simulations miss {np.exp(better / len(trial.given.observed)):.2g} "
+                f"{column[before]!r} taken off, simulations miss {np.exp(better / len(case.trial.given.observed)):.2g} "
                 "times less; log the difference, or write it as a column of its own"
             )
     return doubts
+
+
+def _of_joints(
+    case: Case, asked: Sequence[Question], targets: Sequence[str], answers: Sequence[Answer]
+) -> list[Question]:
+    """The questions, of which those are open that are of joints' columns or of what drives these."""
+    joints = {f"actuator:{a.name}": f"joint:{a.joint.name}.position" for a in case.machine.actuators if a.joint}
+    of = [{joints.get(t := case.draft.readings[k].match.target, t) for k in q.readings} for q in asked]
+    return [
+        question if own & {*targets} else replace(question, answers=(answer,))
+        for question, own, answer in zip(asked, of, answers, strict=True)
+    ]
 
 
 def _chained(model: mujoco.MjModel, machine: Machine, measured: dict[str, int]) -> list[tuple[str, str]]:

@@ -15,10 +15,11 @@ from sipe_bayes.calibration.config_tables import Command, Measurement
 from sipe_bayes.calibration.init.columns.match import Match
 from sipe_bayes.calibration.init.columns.names import read_name
 from sipe_bayes.calibration.init.columns.signals import turn_of
-from sipe_bayes.calibration.init.decisions import AGAINST, decide, fitted_miss
+from sipe_bayes.calibration.init.decisions import AGAINST, decide
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading
 from sipe_bayes.calibration.init.fits import delay_of, fit
 from sipe_bayes.calibration.init.machine import Machine, Sizes
+from sipe_bayes.calibration.init.ranking import fitted_miss
 from sipe_bayes.calibration.init.readings import with_velocities
 from sipe_bayes.calibration.init.tables import Opened, open_table
 from sipe_bayes.calibration.init.trials import Assumption, Trial, followed

@@ -15,6 +15,7 @@ import scipy.optimize
 from sipe_bayes.calibration.init.draft import Unknown
 from sipe_bayes.calibration.init.trials import Assumption, Trial, spread_of
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.inference.recorded import Tell, silent
 
 _STEP = 0.02  # of the cube, of finite differences
 _START_STEP = 1e-4  # rad or m, rad/s or m/s
@@ -25,6 +26,9 @@ _LOST = 1e6  # of a simulation that has diverged
 _LEAST = 2e-3  # of the motion: noise is taken for no smaller
 _SETTLED = 0.02  # of the logarithm of what is left, of all channels together
 _TELLING = 0.02  # of the squared miss, from which a delay is asked for
+AFFORDED = 250_000
+"""Physics steps of a round of a fit: about 6 s with a dozen joints on a free base."""
+_FEWEST = 9  # windows, whatever they cost: less of a log tells little
 _LITTLE = 1.1  # times the miss without a delay, below which it is uncertain
 _EVEN = 4.0  # both sides of the best delay are about as steep, or no parabola goes through them
 
@@ -100,7 +104,14 @@ class _Slopes:
         return values - np.einsum("wrf,...wf->...wr", self.by_start, self.start_of(values))
 
 
-def fit(trial: Trial, assumption: Assumption, delays: Sequence[int], rounds: int) -> Fit:
+def fit(
+    trial: Trial,
+    assumption: Assumption,
+    delays: Sequence[int],
+    rounds: int,
+    tell: Tell = silent,
+    afforded: int = AFFORDED,
+) -> Fit:
     """Gauss-Newton steps at every delay, of which those near the best are followed.
 
     Args:
@@ -108,14 +119,17 @@ def fit(trial: Trial, assumption: Assumption, delays: Sequence[int], rounds: int
         assumption: how columns are read; its delay is where the search begins.
         delays: control steps that are tried first.
         rounds: of steps.
+        tell: called with how far it is.
+        afforded: physics steps of a round, for which windows are left out.
     """
+    trial = trial.thinned(_windows(trial, len({*delays, assumption.delay}), afforded))
     zero = np.zeros((trial.flight(assumption).count, 2 * trial.simulator.model.nv))
     begun = {d: _Point(trial.theta, zero) for d in sorted({*delays, assumption.delay})}
-    points, slopes, best = _descended(trial, assumption, begun, assumption.delay, rounds)
+    points, slopes, best = _descended(trial, assumption, begun, assumption.delay, rounds, tell)
     if best != assumption.delay and best != max(begun):  # that no delay is as good, from where the late one ended
         there, near = points[best], {assumption.delay, best - 1, best, best + 1}
         again = {d: _Point(there.theta, there.starts) for d in sorted(near)}
-        others, other_slopes, other = _descended(trial, assumption, again, best, rounds)
+        others, other_slopes, other = _descended(trial, assumption, again, best, rounds, tell)
         if others[other].cost < there.cost:
             slopes, best = other_slopes, other
         points |= {d: point for d, point in others.items() if d not in points or point.cost < points[d].cost}
@@ -123,8 +137,24 @@ def fit(trial: Trial, assumption: Assumption, delays: Sequence[int], rounds: int
     return _outcome(trial, slopes, points, best)
 
 
+def _windows(trial: Trial, delays: int, afforded: int) -> int:
+    """Windows of a fit: the more parameters and starts there are, the more simulations each of them takes."""
+    return max(_FEWEST, int(afforded / _steps_of_window(trial, delays)))
+
+
+def fit_steps(trial: Trial, delays: int, afforded: int) -> float:
+    """Physics steps of a round of a fit at so many delays."""
+    windows = min(_windows(trial, delays, afforded), sum(map(len, trial.places)))
+    return windows * _steps_of_window(trial, delays)
+
+
+def _steps_of_window(trial: Trial, delays: int) -> float:
+    each = delays + len(trial.theta) + 2 * trial.simulator.model.nv
+    return each * trial.steps / sum(map(len, trial.places))
+
+
 def _descended(
-    trial: Trial, assumption: Assumption, begun: dict[int, _Point], best: int, rounds: int
+    trial: Trial, assumption: Assumption, begun: dict[int, _Point], best: int, rounds: int, tell: Tell
 ) -> tuple[dict[int, _Point], _Slopes, int]:
     """The best point of each delay that was followed to the end, the last slopes, and the best delay, where they are.
 
@@ -134,6 +164,7 @@ def _descended(
     points, tentative, by_delay = dict(begun), dict(begun), dict[int, _Slopes]()
     widest, last = max(points), dict.fromkeys(points, np.inf)
     for turn in range(rounds):
+        tell(f"step {turn + 1} of {rounds} at most")
         slopes, linearised = _slopes(trial, assumption, tentative, best), best
         for (d, point), cost in zip(list(tentative.items()), _costs(slopes, trial), strict=True):
             known = points.get(d, point)

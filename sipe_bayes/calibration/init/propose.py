@@ -21,6 +21,7 @@ from sipe_bayes.calibration.init.forces import with_forces
 from sipe_bayes.calibration.init.kinematics.poses import with_pose_rates
 from sipe_bayes.calibration.init.kinematics.rates import rates_of, with_evidence_of, with_rates
 from sipe_bayes.calibration.init.machine import Machine, Sizes, touching_bodies
+from sipe_bayes.calibration.init.ranking import Case, ranked_of, under
 from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
 from sipe_bayes.calibration.init.tables import Opened, open_table
 from sipe_bayes.calibration.init.trials import Trial
@@ -287,27 +288,31 @@ def _decided(
     draft = with_pose_rates(with_rates(draft, rates), model, machine, sources, folder)
     part = tried_part(draft)
     rest = tuple(r for r in draft.measurements if r not in part.measurements)
-    tell("zeros of joints")
     trial, layout = trial_of(part, model, machine, loaded(part, sources, folder), folder, FEW)
-    against_world = absolute_angles(part, model, machine, trial, layout)
+    signs, zeros = (under(tell, phase) for phase in ("units and signs", "zeros of joints"))
+    case = Case(part, machine, trial, layout, trial.theta, signs)
+    ranking = ranked_of(case)
+    against_world = absolute_angles(case, model, ranking)
     wide, _ = trial_of(part, model, machine, trial.logs, folder, SOME)
-    placed = with_zeros(part, model, machine, wide, layout)
+    placed, unplaced = with_zeros(replace(case, trial=wide, theta=wide.theta, tell=zeros), model, ranking)
     if placed != part:
         moved, layout = trial_of(placed, model, machine, loaded(placed, sources, folder), folder, FEW)
-        left = absolute_angles(placed, model, machine, moved, layout)
+        case = Case(placed, machine, moved, layout, moved.theta, signs)
+        again = ranked_of(case)
+        left = absolute_angles(case, model, again)
         if not (against_world and left):  # else it was no zero that made an angle look like one against the world
-            part, trial, against_world = placed, moved, left
-    tell("units and signs")
-    part = decide(part, machine, trial, layout)
+            part, trial, against_world, ranking = placed, moved, left, again
+    part = decide(part, machine, trial, layout, ranking, signs)
     part, unlike = with_forces(part, forces, model, machine, sources, folder)
     logs = loaded(part, sources, folder)
-    tell("delay and unknowns")
-    unknowns, delay, notes, lost = _unknowns(part, model, machine, logs, folder)
+    last = under(tell, "delay and unknowns")
+    unknowns, delay, notes, lost = _unknowns(part, model, machine, logs, folder, last)
     unknowns, doubts = _some(unknowns)
     window, why = _window(machine, logs, trial)
     done = replace(
         part, measurements=(*part.measurements, *rest), unknowns=tuple(unknowns), window=window, window_note=why,
-        notes=(*draft.notes, *unlike, *notes), doubts=(*against_world, *part.doubts, *lost, *doubts), delay=delay,
+        notes=(*draft.notes, *unlike, *notes), delay=delay,
+        doubts=(*against_world, *unplaced, *part.doubts, *lost, *doubts),
     )  # fmt: skip
     return with_evidence_of(done, rates)
 
@@ -320,7 +325,7 @@ def _undecided(draft: Draft, model: mujoco.MjModel, machine: Machine) -> Draft:
 
 
 def _unknowns(
-    draft: Draft, model: mujoco.MjModel, machine: Machine, logs: Sequence[Trajectory], folder: Path
+    draft: Draft, model: mujoco.MjModel, machine: Machine, logs: Sequence[Trajectory], folder: Path, tell: Tell
 ) -> tuple[list[Unknown], float, list[str], list[str]]:
     """Parameters that these logs tell apart, the delay in samples, notes, and doubts of columns that nothing follows.
 
@@ -342,7 +347,7 @@ def _unknowns(
     names = list(trial.simulator.space.names)
     unknowns = [unknown for unknown in unknowns if unknown.name in names]
     actuators = [r.match.target.removeprefix("actuator:") for r in draft.commands]
-    left = fit(trial, trial.given, delays_of(trial, logs[0].dt), _ROUNDS)
+    left = fit(trial, trial.given, delays_of(trial, logs[0].dt), _ROUNDS, tell)
     late, note = delay_of(actuators, left, logs[0].dt)
     samples = left.finer if late else 0.0
     given = trial.simulator.space.default_theta

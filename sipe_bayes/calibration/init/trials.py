@@ -9,6 +9,7 @@ are missing are bridged by straight lines, and windows with long gaps are not ta
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -113,9 +114,27 @@ class Trial:
         self.given = Assumption.as_given(len(environment.channels), logs[0].actions.shape[1])
 
     @property
+    def steps(self) -> int:
+        """Physics steps of all windows once."""
+        return sum(map(len, self.places)) * self.length * self.simulator.physics_steps(self.logs[0].dt)[0]
+
+    @property
     def theta(self) -> FloatArray:
         """The unknowns as the model has them (N,)."""
         return np.clip(self.simulator.space.default_theta, 0.0, 1.0)
+
+    def thinned(self, windows: int) -> Trial:
+        """With so many windows at most, spread over those that it has."""
+        count = sum(map(len, self.places))
+        if count <= windows:
+            return self
+        kept = np.zeros(count, bool)
+        kept[np.round(np.linspace(0, count - 1, windows)).astype(int)] = True
+        parts = np.split(kept, np.cumsum([len(places) for places in self.places])[:-1])
+        fewer = copy(self)
+        fewer.places = [places[part] for places, part in zip(self.places, parts, strict=True)]
+        fewer._read = {}
+        return fewer
 
     def misses(self, assumptions: Sequence[Assumption], theta: FloatArray) -> FloatArray:
         """What simulations with theta (N,) miss of each assumption and channel (H, C); 1 is no better than a line."""

@@ -11,9 +11,9 @@ from pydantic import ValidationError
 
 from sipe_bayes.calibration.config_fields import ConfigError, one_line
 from sipe_bayes.calibration.config_tables import LogEntry
-from sipe_bayes.calibration.init.decisions import Layout
 from sipe_bayes.calibration.init.draft import Draft, Reading, Unknown
 from sipe_bayes.calibration.init.machine import Drive, Machine, Sizes
+from sipe_bayes.calibration.init.ranking import Layout
 from sipe_bayes.calibration.init.trials import Trial
 from sipe_bayes.calibration.init.unknowns.candidates import as_parameters, candidates
 from sipe_bayes.calibration.logs import load_logs
