@@ -75,6 +75,6 @@ def test_slopes_are_those_of_the_best_point(monkeypatch: pytest.MonkeyPatch) -> 
     steps = iter([good, far])
     monkeypatch.setattr(fits, "_slopes", lambda *_: next(steps))
     begun = {0: fits._Point(np.full(1, 0.5), np.zeros((2, 1)))}
-    points, slopes, best = fits._descended(None, None, begun, 0, rounds=2)  # type: ignore[arg-type]
+    points, slopes, best = fits._descended(None, None, begun, 0, 2, lambda _: None)  # type: ignore[arg-type]
     assert (slopes is good, best) == (True, 0)
     np.testing.assert_array_equal(points[0].theta, 0.5)
