@@ -97,7 +97,8 @@ class Ranking:
         scores: the smaller the better.
         misses: (H, C) of each channel.
         decided: by how much a simulation has to be better than another one, so that it tells.
-        named: the answers of the names, against which the model as given has to tell; None where it is fitted.
+        named: the answers of the names, against which simulations have to tell.
+        fitted: whether the unknowns were.
         left: changes that were too many to be tried.
     """
 
@@ -105,17 +106,18 @@ class Ranking:
     scores: FloatArray
     misses: FloatArray
     decided: float
-    named: tuple[Answer, ...] | None = None
+    named: tuple[Answer, ...]
     left: int = 0
+    fitted: bool = False
 
     @property
     def best(self) -> int:
-        """Which misses least, or of those that the model as given does not tell from it, the nearest to the names."""
+        """Which misses least, or of those not told from it the nearest to the names; once fitted, of signs alone."""
         least = int(np.argmin(self.scores))
-        if self.named is None:
-            return least
-        names, near = self.named, [i for i in range(len(self.scores)) if not self.tells(least, i)]
-        return min(near, key=lambda i: (len(self.changed(i, names)), self.scores[i]))
+        near = [i for i in range(len(self.scores)) if not self.tells(least, i)]
+        if self.fitted:
+            near = [i for i in near if self._signs_alone(least, i)]
+        return min(near, key=lambda i: (len(self.changed(i, self.named)), self.scores[i]))
 
     def gap(self, question: int, answer: Answer) -> float:
         """By how much the best combination with another answer to a question is worse."""
@@ -130,8 +132,10 @@ class Ranking:
         """Whether a combination is clearly worse: of signs in some channel too, not by a little in each of many."""
         if self.scores[other] - self.scores[best] < self.decided:
             return False
-        signs = all(isinstance(self.answers[other][q], int) for q in self.changed(other, self.answers[best]))
-        return not signs or self.times(best, other) >= np.exp(self.decided)
+        return not self._signs_alone(best, other) or self.times(best, other) >= np.exp(self.decided)
+
+    def _signs_alone(self, best: int, other: int) -> bool:
+        return all(isinstance(self.answers[other][q], int) for q in self.changed(other, self.answers[best]))
 
     def times(self, best: int, other: int) -> float:
         """What a combination misses in terms of the best, in the channel in which that is most."""
@@ -351,7 +355,7 @@ def fitted(
     as_far[behind] = ranking.misses[[rest[k] for k in behind]] * misses[first] / ranking.misses[rivals[first]]
     answers = [ranking.answers[i] for i in (*rivals, *rest)]
     all_scores, all_misses = np.array([*scores, *shifted.tolist()]), np.array([*misses, *as_far])
-    return Ranking(answers, all_scores, all_misses, DECIDED, None, ranking.left), thetas[first]
+    return Ranking(answers, all_scores, all_misses, DECIDED, ranking.named, ranking.left, True), thetas[first]
 
 
 def fitted_miss(trial: Trial, assumption: Assumption, rounds: int) -> tuple[float, FloatArray]:
