@@ -84,10 +84,10 @@ def propose(
     model = compile_spec(load_spec(str(model_path)), str(model_path))
     machine = Machine.of(model)
     files = _files(logs)
-    opened = open_table(files[0], read_table(files[0]), rate)
+    opened, others = _opened(files, rate)
     matches = match_columns(machine, opened.columns)
     _check_some(machine, matches, opened, files[0])
-    tables = [opened.columns, *(open_table(f, read_table(f), rate).columns for f in _others(files))]
+    tables = [one.columns for one in (opened, *others)]
     table, turns = straightened(tables, matches, machine)
     measurements, commands = first_readings(machine, matches, table, turns, opened.clock)
     lines, sources, dropped = _split(files, opened, measurements, commands, folder)
@@ -148,9 +148,16 @@ def _files(logs: Sequence[Path]) -> list[Path]:
     return list(dict.fromkeys(out))
 
 
-def _others(files: Sequence[Path]) -> list[Path]:
-    """Some of the files beside the first."""
-    return [files[i] for i in _spread(len(files)) if i]
+def _opened(files: Sequence[Path], rate: float | None) -> tuple[Opened, list[Opened]]:
+    """The log by whose columns quantities are looked for, and some others.
+
+    That is the one in which most of the first one's columns change: a joint may stand still in one motion of several.
+    """
+    names, some = {*read_table(files[0])}, [files[i] for i in _spread(len(files))]
+    looked = [open_table(file, read_table(file), rate) for file in some]
+    alike = [looked[0], *(one for one in looked[1:] if names.issuperset(one.columns))]
+    most = max(alike, key=lambda one: len(one.columns))
+    return most, [one for one in looked if one is not most]
 
 
 def _is_log(folder: Path) -> bool:

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from sipe_bayes.calibration.config import load_config
 from sipe_bayes.calibration.init.draft import Draft
-from sipe_bayes.calibration.init.propose import propose
+from sipe_bayes.calibration.init.propose import _opened, propose
 from sipe_bayes.calibration.init.write import summary, toml_of
 from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.cli.app import app
@@ -239,3 +239,15 @@ def test_what_a_chain_ties_to_a_velocity_alone_starts_where_the_model_does(
     assert [doubt for doubt in draft.open_doubts if "rocker" in doubt] == [
         "no column measures rocker: windows start it where the model does"
     ] * blind
+
+
+def test_columns_are_looked_for_in_the_log_in_which_most_of_them_change(tmp_path: Path) -> None:
+    """A hip that stands still in squats moves in a trot; what only another log has is not what the first one has."""
+    time = 0.01 * np.arange(50)
+    still, moved = np.zeros(50), np.sin(time)
+    pd.DataFrame({"t": time, "hip": still, "knee": moved}).to_csv(tmp_path / "squat.csv", index=False)
+    pd.DataFrame({"t": time, "hip": moved, "knee": moved}).to_csv(tmp_path / "trot.csv", index=False)
+    pd.DataFrame({"t": time, "hip": moved, "knee": moved, "tail": moved}).to_csv(tmp_path / "run.csv", index=False)
+    opened, others = _opened([tmp_path / f"{name}.csv" for name in ("squat", "trot", "run")], None)
+    assert [*opened.columns] == ["hip", "knee"]
+    assert [[*one.columns] for one in others] == [["knee"], ["hip", "knee", "tail"]]
