@@ -148,7 +148,7 @@ def test_wrong_input() -> None:
         (
             lambda: get_estimator(simulator, "laplace").get_parameter_estimate(trajectory),
             ValueError,
-            "nothing has been",
+            "nothing is",
         ),
         (lambda: Segments(0.0), ValueError, "seconds above zero"),
         (lambda: Segments(noise="pink"), ValueError, "expected 'ar1'"),

@@ -272,6 +272,11 @@ class Question:
         """Whether it is a sign."""
         return isinstance(self.answers[0], int)
 
+    @property
+    def sensed(self) -> bool:
+        """Whether it is a sign that a gyro speaks for."""
+        return self.of_sign and self.against == _TURNED
+
 
 def unit_words(reading: Reading, machine: Machine) -> tuple[str, ...]:
     """The units that a column without one in its name may have, the likeliest first."""

@@ -23,7 +23,7 @@ from sipe_bayes.calibration.init.kinematics.rates import rates_of, with_evidence
 from sipe_bayes.calibration.init.machine import Machine, Sizes, touching_bodies
 from sipe_bayes.calibration.init.ranking import Case, ranked_of, under
 from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
-from sipe_bayes.calibration.init.tables import Opened, open_table
+from sipe_bayes.calibration.init.tables import Opened, richest
 from sipe_bayes.calibration.init.trials import Trial
 from sipe_bayes.calibration.init.unknowns.candidates import candidates, scale_is_open, springs
 from sipe_bayes.calibration.init.unknowns.choice import RELATIVE, chosen, roomy, sprung
@@ -84,7 +84,7 @@ def propose(
     model = compile_spec(load_spec(str(model_path)), str(model_path))
     machine = Machine.of(model)
     files = _files(logs)
-    opened, others = _opened(files, rate)
+    opened, others = richest([files[i] for i in _spread(len(files))], rate)
     matches = match_columns(machine, opened.columns)
     _check_some(machine, matches, opened, files[0])
     tables = [one.columns for one in (opened, *others)]
@@ -146,18 +146,6 @@ def _files(logs: Sequence[Path]) -> list[Path]:
             raise LogError(f"{log}: no file matches; correct the pattern")
         out += files
     return list(dict.fromkeys(out))
-
-
-def _opened(files: Sequence[Path], rate: float | None) -> tuple[Opened, list[Opened]]:
-    """The log by whose columns quantities are looked for, and some others.
-
-    That is the one in which most of the first one's columns change: a joint may stand still in one motion of several.
-    """
-    names, some = {*read_table(files[0])}, [files[i] for i in _spread(len(files))]
-    looked = [open_table(file, read_table(file), rate) for file in some]
-    alike = [looked[0], *(one for one in looked[1:] if names.issuperset(one.columns))]
-    most = max(alike, key=lambda one: len(one.columns))
-    return most, [one for one in looked if one is not most]
 
 
 def _is_log(folder: Path) -> bool:

@@ -99,6 +99,7 @@ class Ranking:
         decided: by how much a simulation has to be better than another one, so that it tells.
         named: the answers of the names, against which simulations have to tell.
         fitted: whether the unknowns were.
+        sensed: questions of signs that a gyro speaks for.
         left: changes that were too many to be tried.
     """
 
@@ -107,6 +108,7 @@ class Ranking:
     misses: FloatArray
     decided: float
     named: tuple[Answer, ...]
+    sensed: tuple[int, ...]
     left: int = 0
     fitted: bool = False
 
@@ -129,9 +131,14 @@ class Ranking:
         return [q for q, (a, b) in enumerate(zip(self.answers[row], answers, strict=True)) if a != b]
 
     def tells(self, best: int, other: int) -> bool:
-        """Whether a combination is clearly worse: of signs in some channel too, not by a little in each of many."""
+        """Whether a combination is clearly worse: of signs in some channel too, not by a little in each of many.
+
+        Unless a gyro speaks against one of them.
+        """
         if self.scores[other] - self.scores[best] < self.decided:
             return False
+        if set(self.sensed).intersection(self.changed(other, self.answers[best])):
+            return True
         return not self._signs_alone(best, other) or self.times(best, other) >= np.exp(self.decided)
 
     def _signs_alone(self, best: int, other: int) -> bool:
@@ -229,7 +236,13 @@ class _Search:
     def ranking(self) -> Ranking:
         """All that was tried."""
         scores, named = np.array(list(self.scores.values())), named_answers(self._asked)
-        return Ranking(list(self.scores), scores, np.concatenate(self._misses), _CLEAR, named, self.left)
+        return Ranking(
+            list(self.scores), scores, np.concatenate(self._misses), _CLEAR, named, _sensed(self._asked), self.left
+        )
+
+
+def _sensed(asked: Sequence[Question]) -> tuple[int, ...]:
+    return tuple(q for q, question in enumerate(asked) if question.sensed)
 
 
 def named_answers(asked: Sequence[Question]) -> tuple[Answer, ...]:
@@ -286,7 +299,7 @@ def _tried(case: Case, asked: Sequence[Question], answers: list[tuple[Answer, ..
     misses = np.concatenate(parts)
     scores = followed(misses) + np.array([_odd_sizes(case, readings) for readings in sets])
     scores += [_unlikely(asked, a) for a in answers]
-    return Ranking(answers, scores, misses, _CLEAR, named_answers(asked))
+    return Ranking(answers, scores, misses, _CLEAR, named_answers(asked), _sensed(asked))
 
 
 def _unlikely(asked: Sequence[Question], answers: Sequence[Answer]) -> float:
@@ -355,7 +368,9 @@ def fitted(
     as_far[behind] = ranking.misses[[rest[k] for k in behind]] * misses[first] / ranking.misses[rivals[first]]
     answers = [ranking.answers[i] for i in (*rivals, *rest)]
     all_scores, all_misses = np.array([*scores, *shifted.tolist()]), np.array([*misses, *as_far])
-    return Ranking(answers, all_scores, all_misses, DECIDED, ranking.named, ranking.left, True), thetas[first]
+    return Ranking(answers, all_scores, all_misses, DECIDED, ranking.named, ranking.sensed, ranking.left, True), thetas[
+        first
+    ]
 
 
 def fitted_miss(trial: Trial, assumption: Assumption, rounds: int) -> tuple[float, FloatArray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from sipe_bayes.calibration.init.columns.signals import time_unit
 from sipe_bayes.calibration.readers.base import Columns, LogError
 from sipe_bayes.calibration.readers.many import clock_of, episode, episode_numbers, with_clock
 from sipe_bayes.calibration.readers.numbered import gathered, numbered
+from sipe_bayes.calibration.readers.tables import read_table
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.units import find_unit
 
@@ -76,6 +77,18 @@ def open_table(path: Path, table: Columns, rate: float | None = None) -> Opened:
     longest = max(times, key=len)
     seconds = float(longest[-1] - longest[0]) * find_unit(clock.unit).factor
     return Opened(clock, episodes, _together(numbers, clock, episodes), seconds)
+
+
+def richest(files: Sequence[Path], rate: float | None = None) -> tuple[Opened, list[Opened]]:
+    """The log by whose columns quantities are looked for, and the others.
+
+    That is the one in which most of the first one's columns change: a joint may stand still in one motion of several.
+    """
+    names = {*read_table(files[0])}
+    opened = [open_table(file, read_table(file), rate) for file in files]
+    alike = [opened[0], *(one for one in opened[1:] if names.issuperset(one.columns))]
+    most = max(alike, key=lambda one: len(one.columns))
+    return most, [one for one in opened if one is not most]
 
 
 def _numbers(column: np.ndarray) -> FloatArray | None:

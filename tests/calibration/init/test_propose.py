@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from sipe_bayes.calibration.config import load_config
 from sipe_bayes.calibration.init.draft import Draft
-from sipe_bayes.calibration.init.propose import _opened, propose
+from sipe_bayes.calibration.init.propose import propose
+from sipe_bayes.calibration.init.tables import richest
 from sipe_bayes.calibration.init.write import summary, toml_of
 from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.cli.app import app
@@ -248,6 +249,6 @@ def test_columns_are_looked_for_in_the_log_in_which_most_of_them_change(tmp_path
     pd.DataFrame({"t": time, "hip": still, "knee": moved}).to_csv(tmp_path / "squat.csv", index=False)
     pd.DataFrame({"t": time, "hip": moved, "knee": moved}).to_csv(tmp_path / "trot.csv", index=False)
     pd.DataFrame({"t": time, "hip": moved, "knee": moved, "tail": moved}).to_csv(tmp_path / "run.csv", index=False)
-    opened, others = _opened([tmp_path / f"{name}.csv" for name in ("squat", "trot", "run")], None)
+    opened, others = richest([tmp_path / f"{name}.csv" for name in ("squat", "trot", "run")])
     assert [*opened.columns] == ["hip", "knee"]
     assert [[*one.columns] for one in others] == [["knee"], ["hip", "knee", "tail"]]
