@@ -98,9 +98,9 @@ class Ranking:
         misses: (H, C) of each channel.
         decided: by how much a simulation has to be better than another one, so that it tells.
         named: the answers of the names, against which simulations have to tell.
-        fitted: whether the unknowns were.
         sensed: questions of signs that a gyro speaks for.
         left: changes that were too many to be tried.
+        fitted: whether the unknowns were.
     """
 
     answers: list[tuple[Answer, ...]]
@@ -368,9 +368,8 @@ def fitted(
     as_far[behind] = ranking.misses[[rest[k] for k in behind]] * misses[first] / ranking.misses[rivals[first]]
     answers = [ranking.answers[i] for i in (*rivals, *rest)]
     all_scores, all_misses = np.array([*scores, *shifted.tolist()]), np.array([*misses, *as_far])
-    return Ranking(answers, all_scores, all_misses, DECIDED, ranking.named, ranking.sensed, ranking.left, True), thetas[
-        first
-    ]
+    after = replace(ranking, answers=answers, scores=all_scores, misses=all_misses, decided=DECIDED, fitted=True)
+    return after, thetas[first]
 
 
 def fitted_miss(trial: Trial, assumption: Assumption, rounds: int) -> tuple[float, FloatArray]:

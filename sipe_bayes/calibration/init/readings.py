@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sipe_bayes.calibration.init.columns.match import Match, Matches
-from sipe_bayes.calibration.init.columns.names import Kind, pieces_of, read_name
+from sipe_bayes.calibration.init.columns.names import SIDES, Kind, pieces_of, read_name
 from sipe_bayes.calibration.init.columns.signals import Slope, likeness, slope_of, turn_of, white_share
 from sipe_bayes.calibration.init.draft import Reading, Scale
 from sipe_bayes.calibration.init.machine import Actuator, Drive, Machine
@@ -26,7 +26,6 @@ _LATE = 1.0  # samples
 _ALIKE = 0.9  # share of variance from which a command is a set-point
 _UNLIKE = 0.2
 _COUNTS = (4096, 1024, 2048, 8192, 16384, 65536, 4000, 2000, 1000, 400, 10000, 20000, 131072, 360)  # to a turn
-_SIDES = {"left", "right", "l", "r"}
 _RARER = (8000, 16000, 32768, 40000, 262144)  # that simulations do not tell from the others
 _FEWEST_COUNTS = 30
 _LEAST_TURN, _MOST_TURNS = 0.01, 12.0
@@ -116,7 +115,7 @@ def counting_alike(positions: Sequence[Reading], machine: Machine) -> list[Readi
     def stem(reading: Reading) -> tuple[str, ...]:
         """Nothing without a side."""
         pieces = pieces_of(f"{reading.match.column}_{names[reading.match.target]}")
-        return tuple(p for p in pieces if p not in _SIDES) if _SIDES.intersection(pieces) else ()
+        return tuple(p for p in pieces if p not in SIDES) if SIDES.intersection(pieces) else ()
 
     left: dict[tuple[str, ...], set[Scale]] = {}
     for reading in positions:

@@ -112,6 +112,9 @@ _OTHERS = {"temp", "temperature", "flag", "error", "err", "status", "mode", "ind
 }  # fmt: skip
 _CELLS = {"cell", "cells"}  # of a battery: their voltages drive nothing
 TURNS = {"cos", "sin", "cosine", "sine"}  # of an angle, as a resolver tells it
+SIDES = {"left", "right", "front", "rear", "back", "hind", "fore", "middle", "mid", "l", "r"}
+SIDES |= {a + b for a in "frhbm" for b in "lr"} | {a + b for a in "lr" for b in "frhbm"}
+"""Words of a name that only say on which side, or at which leg, something is."""
 _UNITS = {
     "rad": "rad", "rads": "rad", "radian": "rad", "radians": "rad", "deg": "deg", "degs": "deg", "degree": "deg",
     "degrees": "deg", "mrad": "mrad", "rev": "rev", "revs": "rev", "turns": "rev", "rpm": "rpm", "dps": "deg/s",

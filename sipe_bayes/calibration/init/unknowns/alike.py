@@ -8,15 +8,13 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from sipe_bayes.calibration.init.columns.names import pieces_of
+from sipe_bayes.calibration.init.columns.names import SIDES, pieces_of
 from sipe_bayes.calibration.init.draft import Unknown
 from sipe_bayes.calibration.init.fits import Fit
 from sipe_bayes.core.arrays import FloatArray
 
 SHARED = ("armature", "damping", "frictionloss", "stiffness", "lag", "bias_velocity", "kv", "gain", "kp", "mass")
 """What is shared first: what logs tell least of."""
-_SIDES = {"left", "right", "front", "rear", "back", "hind", "fore", "middle", "mid", "l", "r", "f", "b", "h", "m"}
-_SIDES |= {a + b for a in ("f", "r", "h", "b", "m") for b in ("l", "r")} | {a + b for a in "lr" for b in "frhbm"}
 _OF_ACTUATOR = ("gainprm", "biasprm", "dynprm", "gear", "forcerange")
 _OF_JOINT = ("dof_damping", "dof_frictionloss", "dof_armature", "jnt_stiffness")
 
@@ -69,7 +67,7 @@ def together(unknowns: Sequence[Unknown], fit: Fit, given: FloatArray, groups: S
 
 def _signature(model: mujoco.MjModel, kind: str, name: str) -> Part:
     """What is the same of parts that are alike."""
-    stem = tuple(piece for piece in pieces_of(name) if piece not in _SIDES)
+    stem = tuple(piece for piece in pieces_of(name) if piece not in SIDES)
     if kind == "body":
         body = model.body(name)
         return (*stem, *body.mass.tolist(), *np.round(np.sort(body.inertia), 12).tolist())
@@ -92,7 +90,7 @@ def _of_actuator(model: mujoco.MjModel, index: int) -> Part:
 def _name(some: Sequence[Unknown], what: str, taken: set[str]) -> str:
     """What the parts' names have in common, else the sort of them."""
     names = [unknown.name.removesuffix(f"_{what}") for unknown in some]
-    stems = {tuple(piece for piece in pieces_of(name) if piece not in _SIDES) for name in names}
+    stems = {tuple(piece for piece in pieces_of(name) if piece not in SIDES) for name in names}
     kind = some[0].targets[0].partition(":")[0]
     stem = "_".join(stems.pop()) if len(stems) == 1 else ""
     word = stem or {"body": "bodies"}.get(kind, f"{kind}s")
