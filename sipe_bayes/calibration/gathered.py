@@ -23,7 +23,7 @@ from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.poses import has_pose
 from sipe_bayes.likelihood.settings import Segments, StateSpace
-from sipe_bayes.likelihood.starts import tied_joints, unmeasured_joints
+from sipe_bayes.likelihood.starts.estimates import tied_joints, unmeasured_joints
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.simulation.simulator import Simulator

@@ -1,6 +1,6 @@
 """How well simulations follow logs: errors over open-loop windows, signals with their band, residuals.
 
-Windows start from the measured state (``likelihood.starts``), so a held-out log needs no fit of its own; a
+Windows start from the measured state (``likelihood.starts.estimates``), so a held-out log needs no fit of its own; a
 parameter that differs between logs takes the mean of the calibrated ones there. Of bodies that tumble the first tenth
 of a second tells the start: a slope of noisy poses is so far off that its error would hide the model's.
 """

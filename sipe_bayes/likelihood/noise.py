@@ -18,7 +18,8 @@ from sipe_bayes.core.rotations import between
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.sequences import Sequence
 from sipe_bayes.likelihood.settings import Segments, StateSpace
-from sipe_bayes.likelihood.starts import are_states, left_by_smoothing, smoothed
+from sipe_bayes.likelihood.starts.estimates import are_states
+from sipe_bayes.likelihood.starts.smoothing import left_by_smoothing, smoothed
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 

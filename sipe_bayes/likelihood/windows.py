@@ -28,16 +28,15 @@ from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_scales, whiten
 from sipe_bayes.likelihood.sequences import Sequence, compared_samples, owned_samples, reached, sequences, spread_blocks
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments, chosen_channels, fitted_rotations
-from sipe_bayes.likelihood.starts import (
+from sipe_bayes.likelihood.starts.estimates import (
     STATE_STEP,
     all_starts_measured,
     are_states,
     contacts_of,
     estimate_states,
-    past_commands,
     start_sd,
-    with_history,
 )
+from sipe_bayes.likelihood.starts.history import past_commands, with_history
 from sipe_bayes.simulation.contacts import Contacts
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import moved

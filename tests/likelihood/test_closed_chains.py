@@ -14,7 +14,7 @@ from sipe_bayes.envs.internal.closed_chains import close, dependent_joints
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.starts import estimate_states, start_sd, unmeasured_joints
+from sipe_bayes.likelihood.starts.estimates import estimate_states, start_sd, unmeasured_joints
 from sipe_bayes.simulation.simulator import Simulator
 
 LINKAGE = """<mujoco><option timestep="0.001" integrator="implicitfast"/><worldbody>

@@ -47,9 +47,10 @@ from sipe_bayes.calibration.readers.tables import READERS, read_table
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 from sipe_bayes.envs.internal.closed_chains import dependent_joints
+from sipe_bayes.envs.internal.resting import resting_joints
 from sipe_bayes.envs.poses import has_pose, is_round
 from sipe_bayes.inference.recorded import Tell, silent
-from sipe_bayes.likelihood.starts import estimate_states
+from sipe_bayes.likelihood.starts.estimates import estimate_states
 
 _PASSED = 300  # states of each log, of which it is looked what they touch
 _LOOKED_AT = 3  # logs that are simulated
@@ -192,8 +193,8 @@ def _unmatched(model: mujoco.MjModel, machine: Machine, matches: Matches, comman
     known = {model.joint(joint.name).id for joint in machine.joints if f"joint:{joint.name}.position" in measured}
     turning = [j for j in range(model.njnt) if has_pose(model, j)]
     known |= {j for j in turning if _poses(model, j) and measured.issuperset(f"body:{p}" for p in _poses(model, j))}
-    chained = {model.joint(joint).name for joint in dependent_joints(model, known)}
-    blind = [j.name for j in machine.joints if f"joint:{j.name}" not in owners and j.name not in chained]
+    follow = {model.joint(joint).name for joint in {*dependent_joints(model, known), *resting_joints(model, known)}}
+    blind = [j.name for j in machine.joints if f"joint:{j.name}" not in owners and j.name not in follow]
     posed = [] if _is_felt(machine, matches) else turning
     blind += [pose for j in posed for pose in _poses(model, j) if f"body:{pose}" not in measured]
     unnamed = sum(not has_pose(model, j) and not model.joint(j).name for j in range(model.njnt))

@@ -44,7 +44,8 @@ from sipe_bayes.likelihood.settings import (
     chosen_channels,
     fitted_rotations,
 )
-from sipe_bayes.likelihood.starts import estimate_states, past_commands, start_sd, with_history
+from sipe_bayes.likelihood.starts.estimates import estimate_states, start_sd
+from sipe_bayes.likelihood.starts.history import past_commands, with_history
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import moved, tangents
 

@@ -25,7 +25,7 @@ from dataclasses import replace
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.likelihood.starts import STATE_STEP
+from sipe_bayes.likelihood.starts.estimates import STATE_STEP
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation
 

@@ -11,7 +11,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.laplace.windows.measured_starts import measured_starts
 from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.starts import estimate_states
+from sipe_bayes.likelihood.starts.estimates import estimate_states
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.report.video import Motion
 from sipe_bayes.simulation.simulator import Simulator

@@ -15,7 +15,7 @@ from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.poses import inertial_joints
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import StateSpace
-from sipe_bayes.likelihood.starts import estimate_states, unmeasured_joints
+from sipe_bayes.likelihood.starts.estimates import estimate_states, unmeasured_joints
 from sipe_bayes.likelihood.state_space.inertial import orientations
 from sipe_bayes.simulation.simulator import Simulator
 

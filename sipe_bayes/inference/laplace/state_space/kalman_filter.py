@@ -16,7 +16,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.inference.laplace.state_space.options import SmoothingTuning
-from sipe_bayes.likelihood.starts import STATE_STEP
+from sipe_bayes.likelihood.starts.estimates import STATE_STEP
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states
 

@@ -42,7 +42,7 @@ from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import NORMAL_MAD, Noise, noise_level, pooled
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import marginal
-from sipe_bayes.likelihood.starts import STATE_STEP
+from sipe_bayes.likelihood.starts.estimates import STATE_STEP
 from sipe_bayes.likelihood.windows import Windows
 
 

@@ -12,7 +12,7 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.envs.sensing import Sensing, delayed
 from sipe_bayes.inference.laplace.options import GrowingTuning
 from sipe_bayes.inference.laplace.windows.growing_windows import tells_starts, told_starts
-from sipe_bayes.likelihood.starts import are_states, estimate_states, velocity_columns
+from sipe_bayes.likelihood.starts.estimates import are_states, estimate_states, velocity_columns
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.tangents import tangents
 

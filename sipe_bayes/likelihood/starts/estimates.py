@@ -8,23 +8,26 @@ from __future__ import annotations
 import functools
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import mujoco
 import numpy as np
 
-from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
-from sipe_bayes.core.rotations import added, between, bridged, inverse, product, quaternions, rotation_vectors, turned
+from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.rotations import bridged, inverse, product, quaternions, rotation_vectors, turned
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.internal.closed_chains import SD, close, dependent_joints, dofs_of
-from sipe_bayes.envs.internal.states import activations_at_rest, filtered_commands, joints_at_rest, own_filters, settle
+from sipe_bayes.envs.internal.resting import loose_joints, rest
+from sipe_bayes.envs.internal.states import activations_at_rest, joints_at_rest, own_filters, settle
 from sipe_bayes.envs.poses import PoseReading, has_pose, inertial_joints, is_round
+from sipe_bayes.likelihood.starts.smoothing import smoothed, smoothed_rotations
 from sipe_bayes.likelihood.state_space.indirect_positions import LogSamples, indirect_positions
 from sipe_bayes.likelihood.state_space.inertial import carried, orientations
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.contacts import Contacts, contacts_along, may_touch
 from sipe_bayes.simulation.simulator import Simulator
 
-_LONGEST, _FORGOTTEN = 2000, 10.0  # commands, longer than any delay; time constants after which a filter has forgotten
+Followed: TypeAlias = dict[int, tuple[float, float]]  # sds of a start's position and velocity by the joint's id
 STATE_STEP = 1e-5  # rad or m, rad/s or m/s: finite differences by a state
 
 
@@ -34,8 +37,8 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = Fa
     Measured coordinates are smoothed by local quadratics over 60 ms, missing samples bridged, unmeasured velocities
     the slopes of the positions. Orientations are smoothed likewise, in rotation vectors from each sample; the joint's
     body is where the measured frame tells. Positions that channels tell without measuring them are where these fit best
-    (``indirect_positions``), and joints of closed chains follow. What no channel tells stays at the model's reset
-    state. The search starts here, and so do the windows of held-out logs.
+    (``indirect_positions``), joints of closed chains follow, and what contact holds rests on it. What no channel tells
+    stays at the model's reset state. The search starts here, and so do the windows of held-out logs.
 
     Args:
         simulator: of the model.
@@ -47,8 +50,8 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = Fa
     return _estimated(simulator, trajectory, raw)[0]
 
 
-def _estimated(simulator: Simulator, trajectory: Trajectory, raw: bool) -> tuple[FloatArray, set[int], list[int]]:
-    """States (T+1, S) along a log; and ids of the joints that channels tell indirectly, and of those that follow."""
+def _estimated(simulator: Simulator, trajectory: Trajectory, raw: bool) -> tuple[FloatArray, set[int], Followed]:
+    """States (T+1, S) along a log; and ids of the joints that channels tell indirectly, and those that follow."""
     model, states = simulator.model, np.tile(simulator.default_state(), (len(trajectory) + 1, 1))
     columns = simulator.environment.state_columns(model)
     measured: dict[int, FloatArray] = {}
@@ -71,7 +74,12 @@ def _estimated(simulator: Simulator, trajectory: Trajectory, raw: bool) -> tuple
         _put_felt(simulator, {r.quantity: r for r in readings if r.joint == joint}, trajectory, states)
     known = measured_joints(simulator, np.asarray(np.isfinite(trajectory.observations).any(0)))
     indirect = _put_indirect(simulator, trajectory, states, known, measured, raw)
-    return states, indirect, close(model, states, simulator.default_state(), known | indirect)
+    follow: Followed = dict.fromkeys(close(model, states, simulator.default_state(), known | indirect), (SD, 10 * SD))
+    loose = loose_joints(model, set(range(model.njnt)) - known - indirect - set(follow))
+    if loose and may_touch(model) and not simulator.environment.stepwise:
+        controls = simulator.environment.control(model, np.empty(0), trajectory.actions)
+        follow |= rest(model, states, controls, trajectory.dt, loose)
+    return states, indirect, follow
 
 
 def _put_indirect(
@@ -233,7 +241,7 @@ def measured_joints(simulator: Simulator, seen: BoolArray) -> set[int]:
 def unmeasured_joints(simulator: Simulator, trajectories: Trajectories) -> list[int]:
     """Ids of the joints whose position no channel with a sample tells: windows start them at the reset state.
 
-    Not those that channels tell indirectly, or a closed chain, all along every log.
+    Not those that channels tell indirectly, a closed chain, or what they rest on, all along every log.
     """
     if are_states(simulator, trajectories.states):
         return []
@@ -251,16 +259,22 @@ def all_starts_measured(simulator: Simulator, trajectories: Trajectories) -> boo
     return known and not unmeasured_joints(simulator, trajectories)
 
 
-def followed_joints(simulator: Simulator, trajectories: Trajectories) -> set[int]:
-    """Ids of the joints that nothing measures and that follow measured ones through closed chains, in every log."""
-    if not simulator.model.neq:
-        return set()
-    return set.intersection(*(set(follow) for _, follow in _inferred(simulator, trajectories)))
+def _followed(simulator: Simulator, trajectories: Trajectories) -> Followed:
+    """The joints that nothing measures and that follow measured ones in every log, with their largest sds."""
+    touch = may_touch(simulator.model) and not are_states(simulator, trajectories.states)
+    if (
+        not (simulator.model.neq or touch)
+        or len(measured_joints(simulator, _seen_in(trajectories))) == simulator.model.njnt
+    ):
+        return {}
+    logs = [follow for _, follow in _inferred(simulator, trajectories)]
+    sds = {j: np.max([own[j] for own in logs], axis=0) for j in set.intersection(*(set(own) for own in logs))}
+    return {j: (float(position), float(velocity)) for j, (position, velocity) in sds.items()}
 
 
 @functools.lru_cache(maxsize=2)  # asked several times of the same logs, and dear of long ones
-def _inferred(simulator: Simulator, trajectories: Trajectories) -> list[tuple[set[int], list[int]]]:
-    """Of each log the ids of the joints that channels tell indirectly, and of those that follow through chains."""
+def _inferred(simulator: Simulator, trajectories: Trajectories) -> list[tuple[set[int], Followed]]:
+    """Of each log the ids of the joints that channels tell indirectly, and those that follow."""
     return [_estimated(simulator, replace(trajectory, states=None), False)[1:] for trajectory in trajectories]
 
 
@@ -275,14 +289,14 @@ def _seen_in(trajectories: Trajectories) -> BoolArray:
 
 
 def start_sd(simulator: Simulator, trajectories: Trajectories) -> FloatArray:
-    """Prior sds (2 nv + na,) of where windows of logs start: narrow of joints that follow through closed chains.
+    """Prior sds (2 nv + na,) of where windows of logs start: narrow of joints that closed chains or contacts tell.
 
     And of filters of the model's own, which the commands before have brought to where they are.
     """
     model, out = simulator.model, simulator.environment.start_sd(simulator.model).copy()
-    for joint in followed_joints(simulator, trajectories):
+    for joint, (position, velocity) in _followed(simulator, trajectories).items():
         dofs = dofs_of(model, joint)
-        out[dofs], out[model.nv + dofs] = SD, 10 * SD
+        out[dofs], out[model.nv + dofs] = position, velocity
     if own_filters(model):
         largest = np.abs(simulator.environment.control(model, np.empty(0), trajectories.actions)).max((0, 1))
         settle(model, out, largest)
@@ -302,99 +316,3 @@ def contacts_of(simulator: Simulator, logs: Sequence[Trajectory]) -> Contacts:
         return Contacts()
     smooth, sampled = ([estimate_states(simulator, log, raw) for log in logs] for raw in (False, True))
     return contacts_along(simulator, smooth, sampled)
-
-
-def smoothed(series: FloatArray, dt: float, derivative: int = 0) -> FloatArray:
-    """Local quadratics over 60 ms, at least 5 samples, of a series (T+1, ...); derivative 1: their slopes in time."""
-    span = _span(len(series), dt)
-    if span < 3:
-        return np.gradient(series, dt, axis=0) if derivative else series
-    weights, columns, half = _weights(span, derivative), series.reshape(len(series), -1), span // 2
-    inner = [np.convolve(column, weights[half, ::-1], "valid") for column in columns.T]
-    ends = weights[:half] @ columns[:span], weights[half + 1 :] @ columns[-span:]
-    smooth = np.concatenate([ends[0], np.stack(inner, axis=1), ends[1]])
-    return np.asarray(smooth.reshape(series.shape) / dt**derivative)
-
-
-def left_by_smoothing(count: int, dt: float) -> float:
-    """Share of white noise's variance in samples less ``smoothed``, away from their ends; 0 of fewer than five."""
-    span = _span(count, dt)
-    return 0.0 if span < 5 else float(1 - _weights(span, 0)[span // 2, span // 2])
-
-
-def _span(count: int, dt: float) -> int:
-    """Samples of a local quadratic, an odd number."""
-    return min(max(5, 2 * round(0.06 / dt / 2) + 1), count - (count + 1) % 2)
-
-
-@functools.lru_cache(maxsize=64)
-def _weights(span: int, derivative: int) -> FloatArray:
-    """Weights (span, span) of a local quadratic's samples, for its value or slope per sample at each of them.
-
-    A. Savitzky, M. Golay 1964, "Smoothing and differentiation of data by simplified least squares procedures",
-    Anal. Chem. 36.
-    """
-    place = np.arange(span) - span // 2
-    powers = np.stack([np.ones(span), place, place**2], axis=1)
-    wanted = np.stack([np.zeros(span), np.ones(span), 2.0 * place], axis=1) if derivative else powers
-    return np.asarray(wanted @ np.linalg.pinv(powers))
-
-
-def smoothed_rotations(vectors: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Rotation vectors (T+1, 3) smoothed as ``smoothed`` does, and angular velocities (T+1, 3) about axes that stay.
-
-    Around each sample a local quadratic is laid through the rotation vectors that lead from it to its neighbours.
-    """
-    count, span = len(vectors), _span(len(vectors), dt)
-    if span < 3:
-        turn = between(vectors[1:], vectors[:-1]) / dt if count > 1 else np.zeros((1, 3))
-        return vectors, np.concatenate([turn, turn[-1:]])[:count]
-    begin = np.clip(np.arange(count) - span // 2, 0, count - span)
-    neighbours = begin[:, None] + np.arange(span)
-    ways = between(vectors[neighbours], vectors[:, None])
-    place = np.arange(count) - begin
-    smooth, slope = ((_weights(span, derivative)[place][..., None] * ways).sum(1) for derivative in (0, 1))
-    return added(vectors, smooth), slope / dt
-
-
-def past_commands(
-    simulator: Simulator, trajectories: Trajectories, log: IntArray, start: IntArray, dt: FloatArray
-) -> list[FloatArray]:
-    """The commands before each start, one row a physics step; before the log its first command.
-
-    Of starts at samples ``start`` (W,) of the logs ``log`` (W,), whose control steps take ``dt`` (W,) seconds.
-    """
-    slowest = max(
-        (float(simulator.model.actuator_dynprm[k, 0]) for k, _ in filtered_commands(simulator.model)), default=0
-    )
-    longest = np.minimum(np.maximum(np.ceil(_FORGOTTEN * slowest / dt), 1), _LONGEST).astype(np.int64)
-    if simulator.model.nhistory:
-        longest[:] = _LONGEST
-    past = []
-    for k, first, seconds, most in zip(log, start, dt, longest, strict=True):
-        skip = simulator.physics_steps(float(seconds))[0]
-        rows = trajectories.actions[k, max(0, first - most) : first]
-        past.append(np.repeat(rows, skip, axis=0) if len(rows) else trajectories.actions[k, :1])
-    return past
-
-
-def with_history(
-    simulator: Simulator,
-    states: FloatArray,
-    past: list[FloatArray],
-    dt: FloatArray,
-    steps: IntArray | int = 0,
-    recorded: BoolArray | bool = False,
-) -> FloatArray:
-    """States (W, S) with the ``past_commands`` that delayed actuators and filters remember; dt (W,) in seconds.
-
-    They are at time zero, or, where firmware has a clock, ``steps`` (W,) control steps after its start. What filters
-    remember is in states that are recorded (W,).
-    """
-    columns = [column for _, column in filtered_commands(simulator.model)]
-    own = states[:, columns].copy()
-    states[:, 0] = steps * dt if simulator.engine.firmware else 0.0
-    timestep = np.array([simulator.physics_steps(float(seconds))[1] for seconds in dt])
-    begun = simulator.environment.history(simulator.model, states, past, timestep)
-    begun[:, columns] = np.where(np.reshape(recorded, (-1, 1)), own, begun[:, columns])
-    return begun

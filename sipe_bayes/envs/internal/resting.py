@@ -1,0 +1,146 @@
+"""Joints of an undriven base that nothing measures and that contact holds: height and pitch of a cart on its wheels.
+
+What a joint rests on tells where it is as well as a sensor would. Along a log it is where the model comes to rest with
+all other joints held at the log's positions, without friction and commands; and whether it stays there is seen in
+simulations of the model as given: how far these lead from it in ``_AHEAD`` seconds is the spread that windows may start
+with. What they lead further from than ``_HELD``, as of a machine that hops, contact does not hold, nor what no contact
+bears on.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Collection, Sequence
+
+import mujoco
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray, IntArray
+
+_HELD = 0.02  # rad or m, root mean square
+_LEAST = 1e-3  # rad or m, and ten times as much a second: no smaller spread is claimed, the model's masses are off
+_WIDER = 2.0  # of the spread that is seen: another model's is another
+_AHEAD, _LOOKS = 0.3, 24  # seconds of a simulation, and how many of a log
+_STILL, _CHECK, _FIRST, _NEXT = (
+    1e-4,
+    10,
+    8000,
+    400,
+)  # rad/s or m/s; steps between looks, for the first sample and others
+_HEAVY, _DAMPED = 1e9, 10.0  # rotor inertia that does not move; damping a second, as a share of a joint's own inertia
+
+
+def loose_joints(model: mujoco.MjModel, unknown: Collection[int]) -> list[int]:
+    """Of the joints that nothing measures those that may rest on something: hinges and slides that nothing drives."""
+    scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    driven = set(model.actuator_trnid[model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT), 0].tolist())
+    return [j for j in unknown if int(model.jnt_type[j]) in scalar and j not in driven]
+
+
+def resting_joints(model: mujoco.MjModel, known: Collection[int]) -> set[int]:
+    """Ids of the joints that contact holds where the model has them; ``known``: those that are measured."""
+    state = np.concatenate([[0.0], model.qpos0, np.zeros(model.nv + model.na)])
+    states = np.tile(state, (2 + round(_AHEAD / model.opt.timestep), 1))
+    loose = loose_joints(model, set(range(model.njnt)) - set(known))
+    return set(rest(model, states, np.zeros((len(states), model.nu)), float(model.opt.timestep), loose))
+
+
+def rest(
+    model: mujoco.MjModel, states: FloatArray, controls: FloatArray, dt: float, joints: Sequence[int]
+) -> dict[int, tuple[float, float]]:
+    """Write where contact holds joints, and how they move there, into states (T+1, S) along a log.
+
+    Args:
+        model: the model.
+        states: of which the other joints are right; those that nothing holds stay as they are.
+        controls: (T, U), as the log has them.
+        dt: seconds of a control step.
+        joints: ids of ``loose_joints``.
+
+    Returns:
+        Of each joint that is held the standard deviations of a start's position and velocity about these states.
+    """
+    held = list(joints)
+    while held and len(states) > 1:
+        places = _settled(model, states, held)
+        if isinstance(places, list):
+            held = places
+            continue
+        at, motion = 1 + model.jnt_qposadr[held], 1 + model.nq + model.jnt_dofadr[held]
+        trial = states.copy()
+        trial[:, at], trial[:, motion] = places, np.gradient(places, dt, axis=0)
+        off = _spread(model, trial, controls, dt, np.concatenate([at, motion]))
+        stays = off[: len(held)] <= _HELD
+        if stays.all():
+            states[:] = trial
+            sd = np.maximum(_WIDER * off, np.repeat([_LEAST, 10 * _LEAST], len(held)))
+            return {j: (float(sd[i]), float(sd[len(held) + i])) for i, j in enumerate(held)}
+        held = [j for j, stay in zip(held, stays, strict=True) if stay]
+    return {}
+
+
+def _settled(model: mujoco.MjModel, states: FloatArray, joints: list[int]) -> FloatArray | list[int]:
+    """Positions (T+1, J) at rest of joints along states (T+1, S); or those of the joints that came to rest in touch."""
+    own, places, dofs = copy.copy(model), model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+    own.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    own.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    own.geom_condim[:], own.pair_dim[:] = 1, 1  # frictionless
+    data = mujoco.MjData(own)
+    own.dof_armature[np.setdiff1d(np.arange(own.nv), dofs)] = _HEAVY
+    own.dof_damping[dofs] += _DAMPED * own.dof_M0[dofs]
+    out, position = np.empty((len(states), len(joints))), states[0, 1 + places]
+    for k, state in enumerate(states):
+        data.qpos[:], data.qvel[:] = state[1 : 1 + model.nq], 0.0
+        data.qpos[places] = position
+        moves = _come_to_rest(own, data, dofs, _NEXT if k else _FIRST)
+        if moves.any() and not k:
+            return [j for j, move in zip(joints, moves, strict=True) if not move]
+        if not k and not (borne := _borne(own, data, dofs)).all():
+            return [j for j, bears in zip(joints, borne, strict=True) if bears]
+        out[k] = position = data.qpos[places]
+    return out
+
+
+def _come_to_rest(model: mujoco.MjModel, data: mujoco.MjData, dofs: IntArray, most: int) -> np.ndarray:
+    """Step until the degrees of freedom (J,) are still; which of them (J,) are not after so many steps."""
+    moves = np.ones(len(dofs), bool)
+    for _ in range(most // _CHECK):
+        for _ in range(_CHECK):
+            mujoco.mj_step(model, data)
+        moves = ~(np.abs(data.qvel[dofs]) < _STILL)
+        if not moves.any():
+            break
+    return moves
+
+
+def _borne(model: mujoco.MjModel, data: mujoco.MjData, dofs: IntArray) -> np.ndarray:
+    """Which degrees of freedom (J,) a contact that carries load bears on."""
+    mujoco.mj_forward(model, data)
+    count = int(data.nefc)
+    jacobian = data.efc_J.reshape(-1, model.nv)[:count]
+    touches = (data.efc_type[:count] >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)) & (
+        data.efc_force[:count] > 0
+    )
+    return np.abs(jacobian[touches][:, dofs]).max(axis=0, initial=0.0) > _LEAST
+
+
+def _spread(
+    model: mujoco.MjModel, states: FloatArray, controls: FloatArray, dt: float, columns: IntArray
+) -> FloatArray:
+    """Root mean squares (C,) of how far simulations from states (T+1, S) are from them in ``columns``; inf if lost."""
+    data, square, count = mujoco.MjData(model), np.zeros(len(columns)), 0
+    ahead = max(1, min(round(_AHEAD / dt), len(states) - 1))
+    steps, physics = max(1, round(dt / model.opt.timestep)), 1 + model.nq + model.nv
+    for first in np.unique(np.linspace(0, len(states) - 1 - ahead, _LOOKS).astype(int)):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:] = states[first, 1 : 1 + model.nq], states[first, 1 + model.nq : physics]
+        data.act[:] = states[first, physics : physics + model.na]
+        for k in range(first, first + ahead):
+            data.ctrl[:] = controls[k]
+            for _ in range(steps):
+                mujoco.mj_step(model, data)
+            now = np.concatenate([[data.time], data.qpos, data.qvel])
+            square += (now[columns] - states[k + 1, columns]) ** 2
+            count += 1
+    off = np.sqrt(square / count)
+    return np.where(np.isfinite(off), off, np.inf)

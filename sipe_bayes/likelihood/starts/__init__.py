@@ -1,0 +1,1 @@
+"""States along recorded logs: where windows start."""
