@@ -12,11 +12,14 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
 _LOOKS = 2000  # samples that are looked at, spread evenly
 _APART = 0.05  # of the smaller geom's size, that two are apart beyond what noise makes of one that rests on the other
+_SHORT, _WIDE, _JUMPS = 1e-5, 0.02, 3.0  # of the cube; how many times as steep the short way tells jumps
+_BEGINNINGS, _DIRECTIONS, _SECONDS = 8, 3, 0.5  # of simulations that are compared
 
 
 @dataclass(frozen=True)
@@ -26,10 +29,12 @@ class Contacts:
     Args:
         touch: whether any two geoms touch.
         change: whether two touch in some of the states and are clearly apart in others.
+        rough: whether what touches all along slips and sticks, as a cart's wheels may: simulations jump by parameters.
     """
 
     touch: bool = False
     change: bool = False
+    rough: bool = False
 
 
 def contacts_along(
@@ -54,6 +59,41 @@ def contacts_along(
     seen, count = _touching(model, logs if sampled is None else sampled)
     change = any(_part(model, data, pair, looks) for pair, number in seen.items() if number < count)
     return Contacts(bool(seen), change)
+
+
+def jumps(simulator: Simulator, logs: Sequence[Trajectory], states: Sequence[FloatArray]) -> bool:
+    """Whether simulations are steeper over short changes of the parameters than over wide ones, as none that is smooth.
+
+    Over beginnings spread over the logs, at the model as given and in directions into the cube.
+
+    Args:
+        simulator: of the model.
+        logs: whose commands it follows.
+        states: (T+1, S) along each, where it begins.
+    """
+    theta, rng = simulator.space.default_theta, np.random.default_rng(0)
+    ways = np.where(theta > 0.5, -1, 1) * rng.uniform(0.3, 1.0, (_DIRECTIONS, len(theta)))
+    square, each = np.zeros(2), math.ceil(_BEGINNINGS / len(logs))
+    for log, own in zip(logs, states, strict=True):
+        steps = max(1, min(round(_SECONDS / log.dt), len(log)))
+        first = np.unique(np.linspace(0, len(log) - steps, each).astype(int))
+        moved = [theta[None], *(theta + size * ways for size in (_SHORT, _WIDE))]
+        actions = np.stack([log.actions[k : k + steps] for k in first])
+        thetas = np.tile(np.concatenate(moved), (len(first), 1))
+        count = len(thetas) // len(first)
+        runs = simulator.on_processor.rollout(
+            thetas,
+            np.repeat(actions, count, 0),
+            np.repeat(own[first], count, 0),
+            dt=log.dt,
+            logs=[log.name] * len(thetas),
+        )
+        seen = runs.observations.reshape(len(first), count, steps + 1, -1)
+        seen = seen / np.maximum(np.nanstd(log.observations, axis=0), 1e-9)
+        change = (seen[:, 1:] - seen[:, :1]).reshape(len(first), 2, _DIRECTIONS, -1)
+        finite = np.isfinite(change).all((1, 2, 3))
+        square += (change[finite] ** 2).sum((0, 2, 3))
+    return bool(math.sqrt(square[0]) / _SHORT > _JUMPS * math.sqrt(square[1]) / _WIDE)
 
 
 def _spread(count: int) -> IntArray:

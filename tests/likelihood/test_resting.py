@@ -111,4 +111,5 @@ def test_masses_come_back_through_the_wheels() -> None:
     z = (posterior.mean.numpy() - truth) / posterior.stddev.numpy()
     print(z, posterior.stddev.numpy(), [f.code for f in estimator.findings])
     assert (np.abs(z) < 4).all()
-    assert posterior.stddev.numpy()[1] < 0.02 and not estimator.findings
+    assert posterior.stddev.numpy()[1] < 0.02
+    assert not estimator.findings

@@ -24,7 +24,7 @@ from sipe_bayes.likelihood.starts.smoothing import smoothed, smoothed_rotations
 from sipe_bayes.likelihood.state_space.indirect_positions import LogSamples, indirect_positions
 from sipe_bayes.likelihood.state_space.inertial import carried, orientations
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
-from sipe_bayes.simulation.contacts import Contacts, contacts_along, may_touch
+from sipe_bayes.simulation.contacts import Contacts, contacts_along, jumps, may_touch
 from sipe_bayes.simulation.simulator import Simulator
 
 Followed: TypeAlias = dict[int, tuple[float, float]]  # sds of a start's position and velocity by the joint's id
@@ -315,4 +315,6 @@ def contacts_of(simulator: Simulator, logs: Sequence[Trajectory]) -> Contacts:
     if not may_touch(simulator.model):
         return Contacts()
     smooth, sampled = ([estimate_states(simulator, log, raw) for log in logs] for raw in (False, True))
-    return contacts_along(simulator, smooth, sampled)
+    contacts = contacts_along(simulator, smooth, sampled)
+    steady = contacts.touch and not contacts.change
+    return replace(contacts, rough=True) if steady and jumps(simulator, logs, smooth) else contacts
