@@ -12,7 +12,8 @@ from sipe_bayes.envs.internal.resting import resting_joints
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.starts.estimates import estimate_states, start_sd, unmeasured_joints
+from sipe_bayes.likelihood.starts.estimates import contacts_of, estimate_states, start_sd, unmeasured_joints
+from sipe_bayes.simulation.contacts import Contacts
 from sipe_bayes.simulation.simulator import Simulator
 
 CART = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
@@ -113,3 +114,55 @@ def test_masses_come_back_through_the_wheels() -> None:
     assert (np.abs(z) < 4).all()
     assert posterior.stddev.numpy()[1] < 0.02
     assert not estimator.findings
+
+
+ROVER = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+<geom name="floor" type="plane" size="20 20 .1"/>
+<body name="base" pos="0 0 .05"><joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
+ <joint name="z" type="slide" axis="0 0 1"/><joint name="yaw" axis="0 0 1"/><joint name="pitch" axis="0 1 0"/>
+ <geom type="box" size=".1 .08 .03" mass="2" contype="0" conaffinity="0"/>
+ <geom type="sphere" size=".02" pos="-.09 0 -.03" mass=".05" friction=".01"/>
+ <body pos=".04 .1 0"><joint name="left" axis="0 1 0" damping=".005" armature=".001"/>
+  <geom type="cylinder" size=".05 .012" euler="90 0 0" mass=".1"/></body>
+ <body pos=".04 -.1 0"><joint name="right" axis="0 1 0" damping=".005" armature=".001"/>
+  <geom type="cylinder" size=".05 .012" euler="90 0 0" mass=".1"/></body></body></worldbody>
+<actuator><velocity name="left" joint="left" kv=".2"/>
+ <velocity name="right" joint="right" kv=".2"/></actuator></mujoco>"""
+
+
+def rover() -> tuple[Simulator, Trajectory]:
+    """Of two driven wheels and a ball behind, and six seconds at 50 Hz, on which the tyres slip at times."""
+    gains = tuple(f"actuator:{side}.{what}" for side in ("left", "right") for what in ("gain", "bias_velocity"))
+    parameters = [
+        Parameter("kv", 0.2, 5.0, targets=gains, relative=True),
+        Parameter("dry", 0.0, 0.1, targets=("joint:left.frictionloss", "joint:right.frictionloss")),
+    ]
+    measured = [f"joint:{joint}.position" for joint in ("x", "y", "yaw", "left", "right")]
+    simulator = Simulator(MjcfEnvironment.build(ROVER, parameters, ["left", "right"], measured), 1)
+    time, rng = 0.02 * np.arange(300), np.random.default_rng(2)
+    phase = rng.uniform(0, 6, (2, 2))
+    actions = 3 * np.sin(2.1 * time[:, None] + phase[0]) + 3 * np.sin(5.3 * time[:, None] + phase[1])
+    theta = simulator.space.normalise(np.array([0.5, 0.03]))
+    motion = simulator.rollout(theta, actions, simulator.default_state(), dt=0.02)
+    noise = np.array([3e-4, 3e-4, 1e-3, 3e-3, 3e-3]) * rng.standard_normal(motion.observations[0].shape)
+    return simulator, Trajectory(motion.observations[0] + noise, actions, 0.02)
+
+
+def test_wheels_that_slip_make_simulations_jump_and_wheels_that_roll_do_not() -> None:
+    """A rover turns on its tyres, a cart rolls straight on: what is asked is whether short differences are luck."""
+    simulator, log = rover()
+    assert contacts_of(simulator, [log]) == Contacts(touch=True, change=False, rough=True)
+    rolling = cart()
+    smooth = contacts_of(rolling, [blind(recorded(rolling, [0.02, 3.0]))])
+    assert smooth == Contacts(touch=True, change=False, rough=False)
+
+
+def test_a_rovers_motors_come_back() -> None:
+    """By short differences the search stayed where it began, with every slope luck."""
+    simulator, log = rover()
+    settings = Segments(window=1.0, noise="white")
+    estimator = Laplace(simulator, likelihood=settings, restarts=1, candidates=0, seed=0)
+    posterior = estimator.fit(log)
+    off = np.abs(posterior.mean.numpy() - simulator.space.normalise(np.array([0.5, 0.03])))
+    print(off, posterior.stddev.numpy(), [f.code.name for f in estimator.findings], estimator.rollouts)
+    assert (off < 0.03).all()  # it began 0.3 off

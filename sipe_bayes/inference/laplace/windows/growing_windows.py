@@ -162,9 +162,13 @@ def start_steps(windows: Windows, size: float) -> FloatArray:
 
 
 def tells_starts(windows: Windows) -> bool:
-    """Whether first moments tell starts: of windows that grow, but of bodies that are only felt (an inertial unit)."""
+    """Whether first moments tell starts: of windows that grow, but of bodies that are only felt (an inertial unit).
+
+    Nor of what slips on the ground all along, which stands where it is measured or rests.
+    """
     simulator = windows.simulator
-    return grows(windows) and not inertial_joints(simulator.model, simulator.environment.poses)
+    felt = inertial_joints(simulator.model, simulator.environment.poses)
+    return grows(windows) and not felt and not windows.contacts.rough
 
 
 def told_starts(windows: Windows, theta: FloatArray, tuning: GrowingTuning) -> FloatArray:
