@@ -15,7 +15,8 @@ from collections.abc import Collection, Sequence
 import mujoco
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
+from sipe_bayes.envs.foreign.quiet import quiet
 
 _HELD = 0.02  # rad or m, root mean square
 _LEAST = 1e-3  # rad or m, and ten times as much a second: no smaller spread is claimed, the model's masses are off
@@ -27,6 +28,7 @@ _STILL, _CHECK, _FIRST, _NEXT = (
     8000,
     400,
 )  # rad/s or m/s; steps between looks, for the first sample and others
+_MOST = 2000  # samples of a log at which it comes to rest; lines between them
 _HEAVY, _DAMPED = 1e9, 10.0  # rotor inertia that does not move; damping a second, as a share of a joint's own inertia
 
 
@@ -60,16 +62,19 @@ def rest(
     Returns:
         Of each joint that is held the standard deviations of a start's position and velocity about these states.
     """
-    held = list(joints)
+    held, model = list(joints), copy.copy(model)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # what diverges is lost
     while held and len(states) > 1:
-        places = _settled(model, states, held)
+        with quiet:
+            places = _settled(model, states, held)
         if isinstance(places, list):
             held = places
             continue
         at, motion = 1 + model.jnt_qposadr[held], 1 + model.nq + model.jnt_dofadr[held]
         trial = states.copy()
         trial[:, at], trial[:, motion] = places, np.gradient(places, dt, axis=0)
-        off = _spread(model, trial, controls, dt, np.concatenate([at, motion]))
+        with quiet:
+            off = _spread(model, trial, controls, dt, np.concatenate([at, motion]))
         stays = off[: len(held)] <= _HELD
         if stays.all():
             states[:] = trial
@@ -88,20 +93,20 @@ def _settled(model: mujoco.MjModel, states: FloatArray, joints: list[int]) -> Fl
     data = mujoco.MjData(own)
     own.dof_armature[np.setdiff1d(np.arange(own.nv), dofs)] = _HEAVY
     own.dof_damping[dofs] += _DAMPED * own.dof_M0[dofs]
-    out, position = np.empty((len(states), len(joints))), states[0, 1 + places]
-    for k, state in enumerate(states):
+    looks = np.unique(np.linspace(0, len(states) - 1, _MOST).astype(int))
+    out, position = np.empty((len(looks), len(joints))), states[0, 1 + places]
+    for k, state in enumerate(states[looks]):
         data.qpos[:], data.qvel[:] = state[1 : 1 + model.nq], 0.0
         data.qpos[places] = position
         moves = _come_to_rest(own, data, dofs, _NEXT if k else _FIRST)
-        if moves.any() and not k:
-            return [j for j, move in zip(joints, moves, strict=True) if not move]
-        if not k and not (borne := _borne(own, data, dofs)).all():
-            return [j for j, bears in zip(joints, borne, strict=True) if bears]
+        stays = ~moves if moves.any() or k else _borne(own, data, dofs)
+        if not (k or stays.all()):
+            return [j for j, stay in zip(joints, stays, strict=True) if stay]
         out[k] = position = data.qpos[places]
-    return out
+    return np.stack([np.interp(np.arange(len(states)), looks, column) for column in out.T], axis=1)
 
 
-def _come_to_rest(model: mujoco.MjModel, data: mujoco.MjData, dofs: IntArray, most: int) -> np.ndarray:
+def _come_to_rest(model: mujoco.MjModel, data: mujoco.MjData, dofs: IntArray, most: int) -> BoolArray:
     """Step until the degrees of freedom (J,) are still; which of them (J,) are not after so many steps."""
     moves = np.ones(len(dofs), bool)
     for _ in range(most // _CHECK):
@@ -113,14 +118,13 @@ def _come_to_rest(model: mujoco.MjModel, data: mujoco.MjData, dofs: IntArray, mo
     return moves
 
 
-def _borne(model: mujoco.MjModel, data: mujoco.MjData, dofs: IntArray) -> np.ndarray:
+def _borne(model: mujoco.MjModel, data: mujoco.MjData, dofs: IntArray) -> BoolArray:
     """Which degrees of freedom (J,) a contact that carries load bears on."""
     mujoco.mj_forward(model, data)
     count = int(data.nefc)
     jacobian = data.efc_J.reshape(-1, model.nv)[:count]
-    touches = (data.efc_type[:count] >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)) & (
-        data.efc_force[:count] > 0
-    )
+    touches = data.efc_type[:count] >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
+    touches &= data.efc_force[:count] > 0
     return np.abs(jacobian[touches][:, dofs]).max(axis=0, initial=0.0) > _LEAST
 
 

@@ -8,8 +8,9 @@ from uncertain and indirect measurements", 2004, https://doi.org/10.1142/S021812
 descend together on beginnings that grow. And since windows meet in theta alone, each takes as much of a step of its
 start as serves it best: one that misses an impact on the way holds back itself, not the search.
 
-A joint that strikes a stop, or a ball that a slide carries, is magnified alike, if its contacts come and go
-(``simulation.contacts``).
+A joint that strikes a stop, or a ball that a slide carries, is magnified alike, if its contacts come and go; and what
+stays on the ground, as a rover on its wheels, where it slips and sticks there: simulations then are steeper over short
+changes of the parameters than over wide ones (``simulation.contacts``).
 
 Contact that chatters (a body that lies or is pushed) jumps over short differences, whose slopes then say nothing, and
 starts would follow them anywhere. So theta moves alone at first, by those starts, over wide differences. They
