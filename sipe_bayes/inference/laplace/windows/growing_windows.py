@@ -167,9 +167,9 @@ def tells_starts(windows: Windows) -> bool:
 
     Nor of what slips on the ground all along, which stands where it is measured or rests.
     """
-    simulator = windows.simulator
-    felt = inertial_joints(simulator.model, simulator.environment.poses)
-    return grows(windows) and not felt and not windows.contacts.rough
+    if not grows(windows) or windows.contacts.rough:
+        return False
+    return not inertial_joints(windows.simulator.model, windows.simulator.environment.poses)
 
 
 def told_starts(windows: Windows, theta: FloatArray, tuning: GrowingTuning) -> FloatArray:
