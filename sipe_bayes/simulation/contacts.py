@@ -89,11 +89,18 @@ def jumps(simulator: Simulator, logs: Sequence[Trajectory], states: Sequence[Flo
             logs=[log.name] * len(thetas),
         )
         seen = runs.observations.reshape(len(first), count, steps + 1, -1)
-        seen = seen / np.maximum(np.nanstd(log.observations, axis=0), 1e-9)
+        seen = seen / _scales(log)
         change = (seen[:, 1:] - seen[:, :1]).reshape(len(first), 2, _DIRECTIONS, -1)
         finite = np.isfinite(change).all((1, 2, 3))
         square += (change[finite] ** 2).sum((0, 2, 3))
     return bool(math.sqrt(square[0]) / _SHORT > _JUMPS * math.sqrt(square[1]) / _WIDE)
+
+
+def _scales(log: Trajectory) -> FloatArray:
+    """Standard deviations (O,) of a log's channels; infinite of those that do not move or have no sample."""
+    out, has = np.full(log.observations.shape[1], np.inf), np.isfinite(log.observations).any(0)
+    out[has] = np.nanstd(log.observations[:, has], axis=0)
+    return np.where(out > 0, out, np.inf)
 
 
 def _spread(count: int) -> IntArray:

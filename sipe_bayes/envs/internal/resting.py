@@ -22,12 +22,8 @@ _HELD = 0.02  # rad or m, root mean square
 _LEAST = 1e-3  # rad or m, and ten times as much a second: no smaller spread is claimed, the model's masses are off
 _WIDER = 2.0  # of the spread that is seen: another model's is another
 _AHEAD, _LOOKS = 0.3, 24  # seconds of a simulation, and how many of a log
-_STILL, _CHECK, _FIRST, _NEXT = (
-    1e-4,
-    10,
-    8000,
-    400,
-)  # rad/s or m/s; steps between looks, for the first sample and others
+_STILL = 1e-4  # rad/s or m/s
+_CHECK, _FIRST, _NEXT = 10, 8000, 400  # steps between looks; at most, for a log's first sample and for each other
 _MOST = 2000  # samples of a log at which it comes to rest; lines between them
 _HEAVY, _DAMPED = 1e9, 10.0  # rotor inertia that does not move; damping a second, as a share of a joint's own inertia
 
