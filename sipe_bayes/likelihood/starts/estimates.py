@@ -78,7 +78,10 @@ def _estimated(simulator: Simulator, trajectory: Trajectory, raw: bool) -> tuple
     loose = loose_joints(model, set(range(model.njnt)) - known - indirect - set(follow))
     if loose and may_touch(model) and not simulator.environment.stepwise:
         controls = simulator.environment.control(model, np.empty(0), trajectory.actions)
+        rates = [column for column in measured if column > model.nq]
+        seen = states[:, rates].copy()
         follow |= rest(model, states, controls, trajectory.dt, loose)
+        states[:, rates] = seen
     return states, indirect, follow
 
 
