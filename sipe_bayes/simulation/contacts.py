@@ -19,7 +19,7 @@ from sipe_bayes.simulation.simulator import Simulator
 _LOOKS = 2000  # samples that are looked at, spread evenly
 _APART = 0.05  # of the smaller geom's size, that two are apart beyond what noise makes of one that rests on the other
 _SHORT, _WIDE, _JUMPS = 1e-5, 0.02, 3.0  # of the cube; how many times as steep the short way tells jumps
-_BEGINNINGS, _DIRECTIONS, _SECONDS = 8, 3, 0.5  # of simulations that are compared
+_BEGINNINGS, _DIRECTIONS, _SECONDS = 32, 3, 0.5  # of simulations that are compared
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,8 @@ def contacts_along(
 def jumps(simulator: Simulator, logs: Sequence[Trajectory], states: Sequence[FloatArray]) -> bool:
     """Whether simulations are steeper over short changes of the parameters than over wide ones, as none that is smooth.
 
-    Over beginnings spread over the logs, at the model as given and in directions into the cube.
+    At beginnings spread over the logs, at the model as given and in directions into the cube, all squares together: it
+    is what the normal equations of a search would be made of.
 
     Args:
         simulator: of the model.
@@ -73,27 +74,26 @@ def jumps(simulator: Simulator, logs: Sequence[Trajectory], states: Sequence[Flo
     """
     theta, rng = simulator.space.default_theta, np.random.default_rng(0)
     ways = np.where(theta > 0.5, -1, 1) * rng.uniform(0.3, 1.0, (_DIRECTIONS, len(theta)))
-    square, each = np.zeros(2), math.ceil(_BEGINNINGS / len(logs))
+    moved = np.concatenate([theta[None], *(theta + size * ways for size in (_SHORT, _WIDE))])
+    slopes, total = [], sum(len(log) for log in logs)
     for log, own in zip(logs, states, strict=True):
-        steps = max(1, min(round(_SECONDS / log.dt), len(log)))
-        first = np.unique(np.linspace(0, len(log) - steps, each).astype(int))
-        moved = [theta[None], *(theta + size * ways for size in (_SHORT, _WIDE))]
-        actions = np.stack([log.actions[k : k + steps] for k in first])
-        thetas = np.tile(np.concatenate(moved), (len(first), 1))
-        count = len(thetas) // len(first)
+        steps, count = max(1, min(round(_SECONDS / log.dt), len(log))), math.ceil(_BEGINNINGS * len(log) / total)
+        first = np.unique(((np.arange(count) + 0.5) / count * (len(log) - steps)).astype(int))
+        each = np.repeat(first, len(moved))
         runs = simulator.on_processor.rollout(
-            thetas,
-            np.repeat(actions, count, 0),
-            np.repeat(own[first], count, 0),
+            np.tile(moved, (len(first), 1)),
+            np.stack([log.actions[k : k + steps] for k in each]),
+            own[each],
             dt=log.dt,
-            logs=[log.name] * len(thetas),
+            logs=[log.name] * len(each),
+            goals=simulator.environment.recorded_goals(log.observations[each]),
         )
-        seen = runs.observations.reshape(len(first), count, steps + 1, -1)
-        seen = seen / _scales(log)
-        change = (seen[:, 1:] - seen[:, :1]).reshape(len(first), 2, _DIRECTIONS, -1)
-        finite = np.isfinite(change).all((1, 2, 3))
-        square += (change[finite] ** 2).sum((0, 2, 3))
-    return bool(math.sqrt(square[0]) / _SHORT > _JUMPS * math.sqrt(square[1]) / _WIDE)
+        seen = runs.observations.reshape(len(first), len(moved), steps + 1, -1) / _scales(log)
+        change = (seen[:, 1:] - seen[:, :1]).reshape(len(first), 2, -1)
+        slopes.append(np.sqrt((change**2).mean(-1)) / [_SHORT, _WIDE])
+    short, wide = np.concatenate(slopes).T
+    finite = np.isfinite(short) & np.isfinite(wide)
+    return bool(np.sum(short[finite] ** 2) > _JUMPS**2 * np.sum(wide[finite] ** 2))
 
 
 def _scales(log: Trajectory) -> FloatArray:

@@ -13,7 +13,7 @@ from typing import TypeAlias
 import mujoco
 import numpy as np
 
-from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.rotations import bridged, inverse, product, quaternions, rotation_vectors, turned
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.internal.closed_chains import SD, close, dependent_joints, dofs_of
@@ -77,12 +77,22 @@ def _estimated(simulator: Simulator, trajectory: Trajectory, raw: bool) -> tuple
     follow: Followed = dict.fromkeys(close(model, states, simulator.default_state(), known | indirect), (SD, 10 * SD))
     loose = loose_joints(model, set(range(model.njnt)) - known - indirect - set(follow))
     if loose and may_touch(model) and not simulator.environment.stepwise:
-        controls = simulator.environment.control(model, np.empty(0), trajectory.actions)
         rates = [column for column in measured if column > model.nq]
         seen = states[:, rates].copy()
-        follow |= rest(model, states, controls, trajectory.dt, loose)
+        follow |= rest(model, states, trajectory.dt, loose, functools.partial(_simulated, simulator, trajectory))
         states[:, rates] = seen
     return states, indirect, follow
+
+
+def _simulated(
+    simulator: Simulator, trajectory: Trajectory, first: IntArray, starts: FloatArray, ahead: int
+) -> FloatArray:
+    """States (B, ahead + 1, S) of the model as given from starts (B, S) at samples ``first`` (B,) of a log."""
+    actions = np.stack([trajectory.actions[k : k + ahead] for k in first])
+    goals = simulator.environment.recorded_goals(trajectory.observations[first])
+    given, logs = simulator.space.default_theta[None], [trajectory.name] * len(first)
+    runs = simulator.on_processor.rollout(given, actions, starts, dt=trajectory.dt, logs=logs, goals=goals)
+    return np.full((len(first), ahead + 1, starts.shape[1]), np.nan) if runs.states is None else runs.states
 
 
 def _put_indirect(
