@@ -8,7 +8,7 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.envs.internal.resting import resting_joints
+from sipe_bayes.envs.internal.resting import loose_joints, resting_joints
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.likelihood.settings import Segments
@@ -89,6 +89,17 @@ def test_what_swings_free_is_not_held() -> None:
     flying = mujoco.MjModel.from_xml_string(text)
     assert resting_joints(flying, ids(simulator, "x", "wheel", "bob")) == set()
     assert resting_joints(simulator.model, ids(simulator, "x", "wheel", "bob")) == set(ids(simulator, "z", "pitch"))
+
+
+def test_what_a_tendon_or_a_parents_drive_moves_is_not_loose() -> None:
+    """Whatever the transmission: only the slide is driven by nothing."""
+    text = """<mujoco><worldbody><body><joint name="h" axis="0 1 0"/><geom size=".1"/>
+    <body pos=".3 0 0"><joint name="k" axis="0 1 0"/><geom size=".1"/></body></body>
+    <body pos="2 0 0"><joint name="free" type="slide"/><geom size=".1"/></body></worldbody>
+    <tendon><fixed name="t"><joint joint="h" coef="1"/></fixed></tendon>
+    <actuator><position tendon="t"/><motor jointinparent="k"/></actuator></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(text)
+    assert loose_joints(model, range(3)) == [model.joint("free").id]
 
 
 @pytest.mark.parametrize(("strength", "held"), [(0.0, True), (60.0, False)], ids=["stands", "hops"])
