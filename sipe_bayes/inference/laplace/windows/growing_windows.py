@@ -163,11 +163,8 @@ def start_steps(windows: Windows, size: float) -> FloatArray:
 
 
 def tells_starts(windows: Windows) -> bool:
-    """Whether first moments tell starts: of windows that grow, but of bodies that are only felt (an inertial unit).
-
-    Nor of what slips on the ground all along, which stands where it is measured or rests.
-    """
-    if not grows(windows) or windows.contacts.rough:
+    """Whether first moments tell starts: of windows that grow, but of bodies that are only felt (an inertial unit)."""
+    if not grows(windows):
         return False
     return not inertial_joints(windows.simulator.model, windows.simulator.environment.poses)
 
