@@ -75,11 +75,17 @@ def _estimated(simulator: Simulator, trajectory: Trajectory, raw: bool) -> tuple
     known = measured_joints(simulator, np.asarray(np.isfinite(trajectory.observations).any(0)))
     indirect = _put_indirect(simulator, trajectory, states, known, measured, raw)
     follow: Followed = dict.fromkeys(close(model, states, simulator.default_state(), known | indirect), (SD, 10 * SD))
-    loose = loose_joints(model, set(range(model.njnt)) - known - indirect - set(follow))
-    if loose and may_touch(model) and not simulator.environment.stepwise:
+    unknown = set(range(model.njnt)) - known - indirect - set(follow)
+    if unknown and may_touch(model) and not simulator.environment.stepwise:
         rates = [column for column in measured if column > model.nq]
         seen = states[:, rates].copy()
-        follow |= rest(model, states, trajectory.dt, loose, functools.partial(_simulated, simulator, trajectory))
+        follow |= rest(
+            model,
+            states,
+            trajectory.dt,
+            loose_joints(model, unknown),
+            functools.partial(_simulated, simulator, trajectory),
+        )
         states[:, rates] = seen
     return states, indirect, follow
 
