@@ -112,6 +112,10 @@ ADVICE: dict[Code, str] = {
         "Nothing to do: the intervals are themselves uncertain by a third to a fifth. More tosses narrow them."
     ),
     Code.SCATTER_UNKNOWN: "Record more windows with impacts, and take out parameters that differ between logs.",
+    Code.SLIPS: (
+        "Use the model to predict, as far as its held-out errors are small. For values, leave out of `parameters` what "
+        "trades with others (masses of wheels, a centre of mass that was measured), and see whether the rest stays."
+    ),
     Code.ROUGH_EVERYWHERE: (
         "Take `npe` or `bayessim` as well. Let windows begin shortly before the contacts that matter."
     ),

@@ -194,6 +194,10 @@ class Code(Enum):
         "impacts make the simulation rough, and {windows} windows are too few to see by their scatter how well the "
         "parameters are known: the intervals may be far too narrow; give at least 8, without parameters per log"
     )
+    SLIPS = blocking(
+        "what touches all along slips and sticks, and there simulations jump over every small change: the intervals "
+        "are of the scatter of {groups} groups of windows, which may all be off together along a ridge"
+    )
     ROUGH_EVERYWHERE = blocking(
         "the simulation is rough at every scale around the optimum (contact): the intervals hold what fits no worse "
         "than its nearest neighbours, and the search may have missed a better place; compare with npe or bayessim"

@@ -113,7 +113,7 @@ def _probed(
     if isinstance(problem.likelihood, StateSpace):
         return None
     windows, theta, noise, starts = fit.windows, fit.theta, fit.noise, fit.starts
-    if {Code.SCATTER, Code.SCATTER_UNKNOWN} & {item.code for item in method.findings}:
+    if {Code.SCATTER, Code.SCATTER_UNKNOWN, Code.SLIPS} & {item.code for item in method.findings}:
         unknown.append(finding(Code.MISFIT_NOT_ASKED))
         return None
     left = float(np.max(noise.sd / np.maximum(windows.spread, np.finfo(float).tiny)))

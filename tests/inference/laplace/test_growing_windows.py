@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sipe_bayes.core.findings import Code
+from sipe_bayes.core.findings import Code, Severity
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.options import GrowingTuning
@@ -150,6 +150,18 @@ def test_a_smooth_problem_keeps_its_curvature() -> None:
     estimates = 0.5 + 0.01 * np.sqrt(8) * rng.normal(size=(8, 2))
     before = optimum(0.01)
     assert scattered(before, estimates, TUNING) is before
+
+
+@pytest.mark.parametrize("spread", [1e-6, 0.1])
+def test_the_scatter_of_what_slips_is_not_believed(spread: float) -> None:
+    """Whether the groups agree or not: they may all be off together."""
+    estimates = 0.5 + spread * np.random.default_rng(0).normal(size=(8, 2))
+    slipped = scattered(optimum(0.01), estimates, TUNING, slips=True)
+    assert slipped.finding is not None
+    assert slipped.finding.code is Code.SLIPS
+    assert slipped.finding.severity is Severity.BLOCKING
+    rest = scattered(optimum(0.01), estimates, TUNING)
+    np.testing.assert_array_equal(slipped.covariance, rest.covariance)
 
 
 def test_no_scatter_is_narrower_than_what_the_logs_leave_open() -> None:

@@ -224,12 +224,19 @@ def group(windows: Windows, number: int, count: int) -> Windows:
     return windows.part(np.arange(number, windows.num_windows, count))
 
 
-def scattered(optimum: WindowOptimum, estimates: FloatArray, tuning: GrowingTuning) -> WindowOptimum:
+def scattered(
+    optimum: WindowOptimum, estimates: FloatArray, tuning: GrowingTuning, slips: bool = False
+) -> WindowOptimum:
     """The optimum with the normal that the scatter of estimates (G, N) gives, where the linearisation's is too narrow.
 
     In no direction is it narrower than that: what the logs leave open, every search leaves where it began.
     Estimates far from the others, whose search was lost, count for nothing while ``tuning.reliable`` are left.
+
+    What slips all along (``slips``) is not believed: its jumps steepen every slope, also along a ridge, where all
+    groups then stay together, however far off.
     """
+    if slips:
+        optimum = replace(optimum, finding=finding(Code.SLIPS, groups=len(estimates)))
     gap = np.abs(estimates - np.median(estimates, axis=0))
     scale = NORMAL_MAD * np.median(gap, axis=0)
     kept = estimates[(gap <= tuning.lost * np.maximum(scale, 1e-9)).all(1)]
@@ -245,8 +252,8 @@ def scattered(optimum: WindowOptimum, estimates: FloatArray, tuning: GrowingTuni
     covariance = not_below(covariance * freedom / (freedom - 2), optimum.covariance)  # of Student's t
     half = 0.5 * (kept.mean(0) - optimum.theta)
     covariance = covariance + np.outer(half, half)
-    scatter = finding(Code.SCATTER, groups=len(estimates), lost=len(estimates) - len(kept))
-    return replace(optimum, mean=optimum.theta + half, covariance=covariance, finding=scatter)
+    reason = optimum.finding if slips else finding(Code.SCATTER, groups=len(estimates), lost=len(estimates) - len(kept))
+    return replace(optimum, mean=optimum.theta + half, covariance=covariance, finding=reason)
 
 
 def not_below(covariance: FloatArray, least: FloatArray) -> FloatArray:

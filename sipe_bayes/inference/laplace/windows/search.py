@@ -150,8 +150,8 @@ class WindowSearch:
         state = replace(state, estimates=(*state.estimates, here.theta))
         if before.group + 1 < count:
             return replace(state, here=self._apart(before.group + 1, state))
-        best = max(state.aside, key=lambda optimum: optimum.evidence)
-        return replace(state, optima=(scattered(best, np.stack(state.estimates), tuning.growing),), done=True)
+        best, slips = max(state.aside, key=lambda one: one.evidence), self.windows.contacts.slips
+        return replace(state, optima=(scattered(best, np.stack(state.estimates), tuning.growing, slips),), done=True)
 
     def _next(self, state: WindowState) -> WindowState:
         """At the next starting point; after the last, groups of windows that tumble are fitted apart."""
