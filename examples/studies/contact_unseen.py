@@ -1,7 +1,8 @@
 """`laplace` on StateSpace through contact, on machines for which nothing in this package was made or changed.
 
 A gripper that closes on a box and carries it, a wheel that a paddle rolls against a sprung stop, an arm that scrapes a
-table, three bumpers in a row (`models/`). Truths, noise, lengths and what is counted are those of `contact.py`.
+table, three bumpers in a row; a finger that flicks a knob, a ball on a tray that tilts, a leg that hops on a spring, a
+hammer that strikes a nail (`models/`). Truths, noise, lengths and what is counted are those of `contact.py`.
 
     python examples/studies/contact_unseen.py --seeds 0 10       # half a minute of a core for each fit, in the mean
 
@@ -32,12 +33,20 @@ JOINTS = {
     "roller": ("paddle", "stop", "wheel_x", "wheel_z", "wheel_turn"),
     "scraper": ("shoulder", "elbow"),
     "bumpers": ("driver", "middle", "last"),
+    "finger": ("base", "tip", "knob"),
+    "tray": ("tilt", "ball_x", "ball_z", "ball_turn"),
+    "monoped": ("x", "z", "hip", "leg"),
+    "hammer": ("swing", "wrist", "nail"),
 }
 MOTORS = {
     "gripper": ("lift", "sweep", "left", "right"),
     "roller": ("push",),
     "scraper": ("shoulder", "elbow"),
     "bumpers": ("push",),
+    "finger": ("base", "tip"),
+    "tray": ("tilt",),
+    "monoped": ("hip", "thrust"),
+    "hammer": ("swing",),
 }
 UNKNOWN = {
     "gripper": [
@@ -64,11 +73,35 @@ UNKNOWN = {
         ("last_mass", 0.5, 2.0, ("body:last.mass",)),
         ("driver_damping", 1.0, 6.0, ("joint:driver.damping",)),
     ],
+    "finger": [
+        ("spinner_mass", 0.2, 0.9, ("body:spinner.mass",)),
+        ("knob_damping", 0.005, 0.05, ("joint:knob.damping",)),
+        ("lower_mass", 0.1, 0.4, ("body:lower.mass",)),
+        ("friction", 0.3, 1.3, ("geom:fingertip.friction", "geom:cap.friction")),
+    ],
+    "tray": [
+        ("ball_mass", 0.1, 0.6, ("body:ball.mass",)),
+        ("stiffness", 3.0, 12.0, ("joint:tilt.stiffness",)),
+        ("tray_mass", 0.6, 2.0, ("body:tray.mass",)),
+        ("friction", 0.1, 1.0, ("geom:plate.friction", "geom:ball.friction")),
+    ],
+    "monoped": [
+        ("trunk_mass", 2.0, 5.0, ("body:trunk.mass",)),
+        ("leg_stiffness", 500.0, 1500.0, ("joint:leg.stiffness",)),
+        ("leg_damping", 5.0, 25.0, ("joint:leg.damping",)),
+        ("friction", 0.3, 1.3, ("geom:foot.friction", "geom:floor.friction")),
+    ],
+    "hammer": [
+        ("head_mass", 0.3, 1.2, ("body:head.mass",)),
+        ("nail_mass", 0.2, 0.9, ("body:nail.mass",)),
+        ("nail_friction", 0.3, 2.5, ("joint:nail.frictionloss",)),
+        ("wrist_stiffness", 0.6, 3.0, ("joint:wrist.stiffness",)),
+    ],
 }
 
 
 def commands(name: str, seed: int, steps: int, count: int) -> FloatArray:
-    """(T, A): sums of sines; about a closed grip, and pressed on the table."""
+    """(T, A): sums of sines; about a closed grip, pressed on the table, and as strong as each machine bears."""
     rng = np.random.default_rng([seed, 3])
     frequency, phase = rng.uniform(0.3, 2.0, (3, count)), rng.uniform(0, 2 * np.pi, (3, count))
     times = contact.DT * np.arange(steps)[:, None, None]
@@ -77,6 +110,10 @@ def commands(name: str, seed: int, steps: int, count: int) -> FloatArray:
         return np.stack([0.06 + 0.1 * actions[:, 0], 0.15 * actions[:, 1], *(0.55 + 0.35 * actions[:, 2:].T)], axis=-1)
     if name == "scraper":
         return np.stack([actions[:, 0] - 0.25, 0.9 * actions[:, 1]], axis=-1)
+    if name == "monoped":
+        return np.clip(actions * [0.6, 1.4], -1, 1)
+    if name in ("finger", "hammer"):
+        return np.clip(1.6 * actions - 0.1, -1, 1)
     return np.asarray(actions)
 
 
