@@ -6,8 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from sipe_bayes.calibration.init.draft import Unknown
+from sipe_bayes.calibration.init.columns.match import Match
+from sipe_bayes.calibration.init.columns.names import read_name
+from sipe_bayes.calibration.init.draft import Reading, Unknown
 from sipe_bayes.calibration.init.fits import Fit, delay_of
+from sipe_bayes.calibration.init.machine import Machine, Sizes
+from sipe_bayes.calibration.init.unknowns.candidates import candidates, springs
 from sipe_bayes.calibration.init.unknowns.choice import roomy, sprung, told_apart
 
 
@@ -100,3 +104,32 @@ def test_a_spring_is_told_where_one_shows(size: float, theta: float, shown: bool
     lines = sprung([mass], [spring], fit)
     assert bool(lines) is shown
     assert all("of about 2 in SI" in line and "'joint:j.stiffness' as a parameter, [0, 4]" in line for line in lines)
+
+
+FOUR_BAR = """<mujoco><option timestep="0.002"/><worldbody>
+  <body name="crank"><joint name="crank" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 0 0 .1" size=".01" mass=".2" contype="0" conaffinity="0"/>
+  <body name="rod" pos="0 0 .1"><joint name="pin" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 .3 0 .1" size=".01" mass=".3" contype="0" conaffinity="0"/></body></body>
+  <body name="rocker" pos=".3 0 0"><joint name="rocker" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 0 0 .2" size=".01" mass=".4" contype="0" conaffinity="0"/></body>
+  <body name="bob" pos="1 0 0"><joint name="bob" axis="0 1 0"/><geom size=".05" mass="1"/></body></worldbody>
+  <equality><connect body1="rod" body2="rocker" anchor=".3 0 .1" active="{}"/></equality>
+  <actuator><motor name="motor" joint="crank"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("active", [True, False])
+def test_what_a_closed_chain_moves_is_asked_for(active: bool) -> None:
+    """Masses, friction and springs of a linkage whose crank alone is measured; not of what hangs beside it."""
+    model = mujoco.MjModel.from_xml_string(FOUR_BAR.format(str(active).lower()))
+    machine, targets = Machine.of(model), {"crank": "joint:crank.position", "u": "actuator:motor"}
+    readings = [Reading(Match((n,), target, read_name(n, set()), 1.0), "") for n, target in targets.items()]
+    sizes = Sizes.of(model, machine, None, None)
+    names = {unknown.name for unknown in candidates(model, machine, readings, sizes)}
+    follow = {"rod_mass", "rocker_mass", *(f"{j}_{w}" for j in ("pin", "rocker") for w in ("damping", "frictionloss"))}
+    assert {"crank_mass", "crank_damping"} <= names
+    assert names & follow == (follow if active else set())
+    assert not {"bob_mass", "bob_damping", "pin_armature"} & names
+    sprung_joints = {spring.targets[0] for spring in springs(model, machine, readings, sizes)}
+    closed = {"joint:pin.stiffness", "joint:rocker.stiffness"} if active else set()
+    assert sprung_joints == {"joint:crank.stiffness"} | closed

@@ -13,6 +13,7 @@ from sipe_bayes.calibration.init.draft import Reading, Unknown
 from sipe_bayes.calibration.init.machine import (
     Actuator,
     Drive,
+    Joint,
     Machine,
     Sizes,
     bases,
@@ -21,6 +22,7 @@ from sipe_bayes.calibration.init.unknowns.contacts import contacts, word_of
 from sipe_bayes.calibration.init.unknowns.resistance import of_joint, of_tendons
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.inertia import body_frame_inertia
+from sipe_bayes.envs.internal.closed_chains import dependent_joints
 from sipe_bayes.envs.sensing import of_sensor
 from sipe_bayes.envs.targets import bind
 
@@ -46,17 +48,19 @@ def candidates(
     """
     measured = {r.match.target.removeprefix("joint:").rpartition(".")[0] for r in readings if not r.commanded}
     joints = [joint for joint in machine.joints if joint.name in measured]
+    passive = _follow(model, machine, joints)
     driven = _driven(machine, readings)
     gains = _shared_by_rotors(
         model, [u for a, r in driven for u in (*_of_actuator(model, a, r), *_lag_of(model, a))], driven
     )
     open_scale = scale_is_open(model, machine, readings)
-    behind = [int(model.joint(joint.name).bodyid[0]) for joint in joints]
+    behind = [int(model.joint(joint.name).bodyid[0]) for joint in (*joints, *passive)]
     bodies = [model.body(body).id for body in machine.bodies]  # what is pushed, or carries joints
     free = bodies if driven else []  # what is only thrown moves alike whatever its mass
     masses, attached = _masses(model, [*behind, *free])
     of_joints = of_tendons(model, [a for a, _ in driven], sizes) if joints else []
     of_joints += [u for joint in joints if not joint.base for u in of_joint(model, joint, sizes)]
+    of_joints += [u for joint in passive for u in of_joint(model, joint, sizes, rotor=False)]
     if open_scale and len(joints) < 2:  # a rotor is so much more mass, to which the gain is relative
         of_joints = [u for u in of_joints if not u.name.endswith("_armature")]
     flown = [body for body in bodies if body in {_thrust_at(model, a) for a, _ in driven}]
@@ -66,6 +70,13 @@ def candidates(
     carrying = bases(model) - {*flown} if driven and not attached else ()
     proposed += [unknown for body in carrying for unknown in _of_base(model, body)]
     return proposed or _masses(model, bodies)[0]
+
+
+def _follow(model: mujoco.MjModel, machine: Machine, joints: Sequence[Joint]) -> list[Joint]:
+    """Joints that nothing measures or drives, and that closed chains make follow those that are measured."""
+    driven = {actuator.joint.name for actuator in machine.actuators if actuator.joint}
+    tied = dependent_joints(model, {model.joint(joint.name).id for joint in joints})
+    return [j for j in machine.joints if model.joint(j.name).id in tied and not j.base and j.name not in driven]
 
 
 def _shared_by_rotors(
@@ -125,9 +136,10 @@ def _zeros(readings: Sequence[Reading]) -> list[Unknown]:
 
 
 def springs(model: mujoco.MjModel, machine: Machine, readings: Sequence[Reading], sizes: Sizes) -> list[Unknown]:
-    """Springs that the model lacks at measured joints: not asked for, but left out of a fit they look like delays."""
+    """Springs that the model lacks at joints that move: not asked for, but left out of a fit they look like delays."""
     measured = {r.match.target for r in readings if not r.commanded}
     joints = [j for j in machine.joints if f"joint:{j.name}.position" in measured and not j.base]
+    joints += _follow(model, machine, joints)
     soft = [j for j in joints if not float(np.ravel(model.joint(j.name).stiffness)[0])]
     return [
         Unknown(

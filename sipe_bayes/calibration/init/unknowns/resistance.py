@@ -13,12 +13,13 @@ from sipe_bayes.calibration.init.machine import Actuator, Joint, Sizes
 from sipe_bayes.calibration.init.unknowns.contacts import word_of
 
 
-def of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes) -> list[Unknown]:
-    """Friction, the inertia of rotor and gears, and the spring where the model has one."""
+def of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes, rotor: bool = True) -> list[Unknown]:
+    """Friction, the inertia of a ``rotor`` and its gears, and the spring where the model has one."""
     dof = int(model.joint(joint.name).dofadr[0])
     own = {what: float(getattr(model, f"dof_{what}")[dof]) for what in _USUAL}
     spring = float(np.ravel(model.joint(joint.name).stiffness)[0])
-    return _unknowns(f"joint:{joint.name}", joint.name, {**own, "stiffness": spring}, sizes, tuple(_USUAL))
+    asked = tuple(what for what in _USUAL if rotor or what != "armature")
+    return _unknowns(f"joint:{joint.name}", joint.name, {**own, "stiffness": spring}, sizes, asked)
 
 
 def of_tendons(model: mujoco.MjModel, driven: Sequence[Actuator], sizes: Sizes) -> list[Unknown]:
