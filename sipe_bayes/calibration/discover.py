@@ -148,5 +148,5 @@ def run_discovery(
         if progress is not None:
             progress(f"comparing before and after: {what}", structures.rollouts, structures.rollouts)
 
-    discovery = summarise(problem, structures, name, chosen, time.monotonic() - began, tell)
+    discovery = summarise(problem, structures, name, chosen, began, tell)
     return write_discovery(replace(discovery, run=record, out=str(folder)), structures, problem, folder)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -57,7 +58,7 @@ _BEFORE = {
 
 
 def summarise(
-    problem: Problem, structures: Structures, name: str, seed: int, seconds: float, tell: Tell = silent
+    problem: Problem, structures: Structures, name: str, seed: int, began: float, tell: Tell = silent
 ) -> Discovery:
     """Everything that is told of a search.
 
@@ -66,7 +67,7 @@ def summarise(
         structures: that were fitted.
         name: of the run.
         seed: of draws.
-        seconds: that the search took.
+        began: when the search did, by ``time.monotonic``; the comparison may take longer than the search.
         tell: called with what is being done.
     """
     after = _Model(problem, structures, structures.best, tell)
@@ -101,7 +102,7 @@ def summarise(
         settled=structures.settled,
         rollouts=structures.rollouts,
         column_rollouts=structures.state.column_rollouts,
-        seconds=seconds,
+        seconds=time.monotonic() - began,
         findings=(*_budget_spent(structures), *_thinned(problem, structures)),
     )
 

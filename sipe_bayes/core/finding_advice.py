@@ -98,7 +98,10 @@ ADVICE: dict[Code, str] = {
         "Often a ridge of parameters that act alike, or a rough simulation: fix one of the parameters of a ridge. "
         f"{_COMPARE}"
     ),
-    Code.WILD_SAMPLES: "Nothing to do for a few. For many look at the sensor, its cable and its driver.",
+    Code.WILD_SAMPLES: (
+        "Nothing to do for a few. For many see whether the column itself jumps: then look at the sensor, its cable and "
+        "its driver; else at what the model lacks."
+    ),
     Code.NOT_SMOOTH: f"{_COMPARE} {_SMOOTHER}",
     Code.STARTS_AT_REST: (
         "Without a pose a window of a free body starts anywhere but where the body was. Measure it, or take the "

@@ -167,7 +167,7 @@ class Code(Enum):
     )
     WILD_SAMPLES = caution(
         "{count} samples of {channels} in {logs} logs were left out of the fit: no smooth motion explains them "
-        "(glitches)"
+        "(glitches, or what the model lacks)"
     )
     NOT_SMOOTH = blocking(
         "at the optimum the simulation is not what its linearisation says, by {gain:.1f} nats of a step or of a "
@@ -320,8 +320,8 @@ class Code(Enum):
     HELD_OUT_WORSE = caution(
         "held-out {log}, {channel}: {rmse:.3g} {unit} is not better than the model as given ({rmse_default:.3g})"
     )
-    LOG_CLOCK = note("{samples} samples passed through unchanged at {rate}; clock jitter {jitter_ms:.3g} ms")
-    LOG_RESAMPLED = note("{samples} samples at {own_rate}, clock jitter {jitter_ms:.3g} ms, resampled to {rate}")
+    LOG_CLOCK = note("{samples} samples passed through unchanged at {rate}; clock jitter up to {jitter_ms:.3g} ms")
+    LOG_RESAMPLED = note("{samples} samples at {own_rate}, clock jitter up to {jitter_ms:.3g} ms, resampled to {rate}")
     LOG_GAP = note("no measurement from {start:.3f} to {stop:.3f} s; commands are held there")
     LOG_RATE = note("{channel} comes at {rate}, in one of {every} samples; between them it is not fitted")
     LOG_MISSING = note("{channel}: {missing} of {samples} samples missing, masked")

@@ -242,10 +242,22 @@ def lack(calibration: Calibration) -> Verdict | None:
     text = f"The model lacks something: it looks like {misfit.cause} ({share}, {misfit.p_text})."
     text += " `sipe discover` tries it." if misfit.shift else ""
     moved = sorted(misfit.moved, key=lambda name: -abs(misfit.shift[name]))[:_DOUBTS]
-    if moved:
+    beyond = [name for name in misfit.moved if _led_out(calibration, name, misfit.shift[name])]
+    if beyond:  # so far off no value is near what a fit with it would give
+        text += (
+            f" Where values would be with it only a fit tells: to first order {_few(beyond)} would leave the bounds."
+        )
+    elif moved:
         values = [_would_be(calibration, name, misfit.shift[name]) for name in moved]
         text += f" With it, to first order, {listed(values)}."
     return Verdict("bad", text)
+
+
+def _led_out(calibration: Calibration, name: str, sds: float) -> bool:
+    """Whether a parameter that moves by so many sds comes to be outside its bounds, by more than a sd."""
+    posterior, j = calibration.posterior, calibration.posterior.space.names.index(name)
+    theta, sd = float(posterior.mode[j]), float(posterior.stddev[j])
+    return not -sd <= theta + sds * sd <= 1 + sd
 
 
 def _would_be(calibration: Calibration, name: str, sds: float) -> str:

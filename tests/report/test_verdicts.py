@@ -173,9 +173,12 @@ def test_what_the_model_lacks_says_where_values_would_be(calibration: Calibratio
     lacks = judged.lack(dataclasses.replace(calibration, misfit=LACKS))
     assert lacks is not None
     assert lacks.text.endswith("tries it. With it, to first order, p1 would be about 1.44, not 1.35 kg m^2.")
-    far = judged.lack(dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, shift={"p1": 1e3, "p2": -2})))
-    assert far is not None
-    assert "p1 would be about 2.0, not 1.3 kg m^2 and p2 would be about 1.64, not 1.70 kg m^2" in far.text
+    both = judged.lack(dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, shift={"p1": 15, "p2": -2})))
+    assert both is not None
+    assert "p1 would be about 1.8, not 1.3 kg m^2 and p2 would be about 1.64, not 1.70 kg m^2" in both.text
+    far = judged.lack(dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, shift={"p1": 30, "p2": -2})))
+    assert far is not None  # a straight line says nothing of where so long a way ends
+    assert far.text.endswith("only a fit tells: to first order p1 would leave the bounds.")
     coloured = judged.lack(dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, shift={})))
     assert coloured is not None
     assert "would" not in coloured.text
