@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sipe_bayes.calibration.checks.fitted import Fit, from_fitted_states, one_by_one, tamed, with_wild
+from sipe_bayes.calibration.checks.fitted import Fit, drifting, from_fitted_states, one_by_one, tamed, with_wild
 from sipe_bayes.calibration.checks.followed import not_followed
 from sipe_bayes.calibration.checks.lacking import lacking
 from sipe_bayes.calibration.checks.plan import Checks, Plan, plan_of, rollouts_of, with_checks
@@ -88,6 +88,7 @@ def calibrate(
         *_own(method, misfit is not None),
         *(finding(Code.AGREEMENT_UNKNOWN, log=name) for name in alone.skipped),
         *lacks.findings,
+        *drifting(fit.channel_noise()),
         *outside.findings,
         *uneven_targets(problem.environment),
         *([] if conflict is None else [conflict.finding]),

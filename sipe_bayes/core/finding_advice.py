@@ -163,6 +163,10 @@ ADVICE: dict[Code, str] = {
     Code.SMALL_MISFIT: "The values may be used. For a better prediction put the cause into the model.",
     Code.MISFIT: _REMEDY_LACKING,
     Code.MISFIT_SHIFTS: f"{_REMEDY_LACKING} Until then read the values as those of a model that is wrong.",
+    Code.NOISE_DRIFTS: (
+        "A model that lacks something leaves such residuals: run `sipe discover`. For predictions compare with "
+        '`noise.model = "white"`, whose fit follows the motion itself.'
+    ),
     Code.MISFIT_NOT_ASKED: "Judge by the held-out logs.",
     Code.NOISE_FREE: "Nothing to do. A log from a machine has noise: add some before you judge what a log would tell.",
     Code.MISFIT_UNKNOWN: "Judge by the residuals in the report and by the held-out logs.",

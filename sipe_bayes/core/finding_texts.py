@@ -258,6 +258,10 @@ class Code(Enum):
     MISFIT_SHIFTS = caution(
         _NOT_NOISE + "; with it in the model the estimate would move, {moved}: {remedy}", "model lacks something"
     )
+    NOISE_DRIFTS = caution(
+        "what is taken for noise of {channels} remembers as long as the logs are ({tau:.2g} s): only changes from "
+        "sample to sample were fitted, not where the motion goes"
+    )
     MISFIT_NOT_ASKED = note(
         "whether the residuals are noise is not asked: through impacts no linearisation says what other physics does"
     )

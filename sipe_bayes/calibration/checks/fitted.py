@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from sipe_bayes.calibration.checks.plan import Check, Checks
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import Kept
+from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.agreement import LogEstimates, disagreement, linear_estimates, log_estimates, parts_of
 from sipe_bayes.diagnostics.evaluate import best_starts, channel_noise, white_noise
@@ -98,6 +100,13 @@ class Fit:
     def channel_noise(self) -> dict[str, ChannelNoise]:
         """Of each fitted channel."""
         return channel_noise(self.windows, self.noise)
+
+
+def drifting(noise: Mapping[str, ChannelNoise]) -> list[Finding]:
+    """That noise of channels, by name, remembers as long as the logs are: a random walk."""
+    mine = [name for name, own in noise.items() if own.tau_at_limit]
+    tau = max((noise[name].tau for name in mine), default=0.0)
+    return [finding(Code.NOISE_DRIFTS, channels=", ".join(mine), tau=tau)] if mine else []
 
 
 def _noise_of(method: Estimator, windows: Windows, theta: FloatArray) -> Noise:
