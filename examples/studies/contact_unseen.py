@@ -4,7 +4,7 @@ A gripper that closes on a box and carries it, a wheel that a paddle rolls again
 table, three bumpers in a row; a finger that flicks a knob, a ball on a tray that tilts, a leg that hops on a spring, a
 hammer that strikes a nail (`models/`). Truths, noise, lengths and what is counted are those of `contact.py`.
 
-    python examples/studies/contact_unseen.py --seeds 0 10       # half a minute of a core for each fit, in the mean
+    python examples/studies/contact_unseen.py --seeds 0 20       # a quarter of a minute of a core for most fits
 
 Fits are kept in runs/contact_unseen and an interrupted study goes on; results/contact_unseen.json holds the summary.
 Where the numbers are looked at to change the method, the machines move to `contact.py`, and others come here.

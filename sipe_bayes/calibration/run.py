@@ -29,7 +29,7 @@ from sipe_bayes.calibration.output import (
 from sipe_bayes.calibration.problem import Problem, method_of, prepare
 from sipe_bayes.core.checkpoint import Kept, fingerprint_of
 from sipe_bayes.core.files import installed_version
-from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.findings import Code, Finding, Findings, finding
 from sipe_bayes.diagnostics.agreement import disagreement
 from sipe_bayes.diagnostics.bands import band_coverage
 from sipe_bayes.diagnostics.identifiability import ridges
@@ -88,7 +88,7 @@ def calibrate(
         *_own(method, misfit is not None),
         *(finding(Code.AGREEMENT_UNKNOWN, log=name) for name in alone.skipped),
         *lacks.findings,
-        *drifting(fit.channel_noise()),
+        *(() if Findings(lacks.findings).of(Code.NOISE_FREE) else drifting(fit.channel_noise())),
         *outside.findings,
         *uneven_targets(problem.environment),
         *([] if conflict is None else [conflict.finding]),

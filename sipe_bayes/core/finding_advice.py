@@ -164,7 +164,8 @@ ADVICE: dict[Code, str] = {
     Code.MISFIT: _REMEDY_LACKING,
     Code.MISFIT_SHIFTS: f"{_REMEDY_LACKING} Until then read the values as those of a model that is wrong.",
     Code.NOISE_DRIFTS: (
-        "A model that lacks something leaves such residuals: run `sipe discover`. For predictions compare with "
+        "A model that lacks something leaves such residuals, or a zero that differs between logs: run `sipe discover`. "
+        "For predictions compare with "
         '`noise.model = "white"`, whose fit follows the motion itself.'
     ),
     Code.MISFIT_NOT_ASKED: "Judge by the held-out logs.",

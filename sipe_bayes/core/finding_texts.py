@@ -195,8 +195,9 @@ class Code(Enum):
         "parameters are known: the intervals may be far too narrow; give at least 8, without parameters per log"
     )
     SLIPS = blocking(
-        "what touches all along slips and sticks, and there simulations jump over every small change: the intervals "
-        "are of the scatter of {groups} groups of windows, which may all be off together along a ridge"
+        "what touches all along seems to slip and stick: simulations are steeper over short changes of the parameters "
+        "than over wide ones, so that neither their slopes nor the scatter of {groups} groups of windows, which may "
+        "all be off along one ridge, says how well values are known"
     )
     ROUGH_EVERYWHERE = blocking(
         "the simulation is rough at every scale around the optimum (contact): the intervals hold what fits no worse "
@@ -259,8 +260,8 @@ class Code(Enum):
         _NOT_NOISE + "; with it in the model the estimate would move, {moved}: {remedy}", "model lacks something"
     )
     NOISE_DRIFTS = caution(
-        "what is taken for noise of {channels} remembers as long as the logs are ({tau:.2g} s): only changes from "
-        "sample to sample were fitted, not where the motion goes"
+        "what is taken for noise of {channels} has a correlation time as long as the logs ({tau:.2g} s): mostly "
+        "changes from sample to sample were fitted, hardly where the motion goes"
     )
     MISFIT_NOT_ASKED = note(
         "whether the residuals are noise is not asked: through impacts no linearisation says what other physics does"

@@ -164,10 +164,12 @@ def test_wheels_that_slip_make_simulations_jump_and_wheels_that_roll_do_not() ->
     logs = [rover(seed) for seed in range(6)]
     for simulator, log in logs:
         assert contacts_of(simulator, [log]) == Contacts(touch=True, change=False, rough=True)
-    assert contacts_of(logs[0][0], [log for _, log in logs]).rough
+    assert contacts_of(logs[0][0], [log for _, log in logs]).slips
     rolling = cart()
     smooth = contacts_of(rolling, [blind(recorded(rolling, [0.02, 3.0]))])
     assert smooth == Contacts(touch=True, change=False, rough=False)
+    assert not smooth.slips
+    assert not Contacts(touch=True, change=True, rough=True).slips
 
 
 def test_a_rovers_motors_come_back() -> None:

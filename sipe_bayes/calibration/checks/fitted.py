@@ -103,7 +103,7 @@ class Fit:
 
 
 def drifting(noise: Mapping[str, ChannelNoise]) -> list[Finding]:
-    """That noise of channels, by name, remembers as long as the logs are: a random walk."""
+    """That noise of channels, by name, has a correlation time as long as the logs: nearly a random walk."""
     mine = [name for name, own in noise.items() if own.tau_at_limit]
     tau = max((noise[name].tau for name in mine), default=0.0)
     return [finding(Code.NOISE_DRIFTS, channels=", ".join(mine), tau=tau)] if mine else []

@@ -133,3 +133,16 @@ def test_what_a_closed_chain_moves_is_asked_for(active: bool) -> None:
     sprung_joints = {spring.targets[0] for spring in springs(model, machine, readings, sizes)}
     closed = {"joint:pin.stiffness", "joint:rocker.stiffness"} if active else set()
     assert sprung_joints == {"joint:crank.stiffness"} | closed
+
+
+def test_a_driven_joint_that_only_its_fellow_measures_is_asked_for() -> None:
+    """Of two fingers that an equality ties, the one that is driven has no column."""
+    fingers = """<mujoco><worldbody><body name="l"><joint name="left" type="slide"/><geom size=".1" mass="1"/></body>
+      <body name="r" pos="1 0 0"><joint name="right" type="slide"/><geom size=".1" mass="1"/></body></worldbody>
+      <equality><joint joint1="left" joint2="right"/></equality>
+      <actuator><position name="a" joint="right" kp="20"/></actuator></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(fingers)
+    machine, targets = Machine.of(model), {"left": "joint:left.position", "u": "actuator:a"}
+    readings = [Reading(Match((n,), target, read_name(n, set()), 1.0), "m") for n, target in targets.items()]
+    names = {u.name for u in candidates(model, machine, readings, Sizes.of(model, machine, None, None))}
+    assert {"l_mass", "r_mass", "left_damping", "right_damping"} <= names

@@ -60,7 +60,8 @@ def candidates(
     masses, attached = _masses(model, [*behind, *free])
     of_joints = of_tendons(model, [a for a, _ in driven], sizes) if joints else []
     of_joints += [u for joint in joints if not joint.base for u in of_joint(model, joint, sizes)]
-    of_joints += [u for joint in passive for u in of_joint(model, joint, sizes, rotor=False)]
+    rotors = {actuator.joint for actuator in machine.actuators}
+    of_joints += [u for joint in passive for u in of_joint(model, joint, sizes, rotor=joint in rotors)]
     if open_scale and len(joints) < 2:  # a rotor is so much more mass, to which the gain is relative
         of_joints = [u for u in of_joints if not u.name.endswith("_armature")]
     flown = [body for body in bodies if body in {_thrust_at(model, a) for a, _ in driven}]
@@ -73,10 +74,9 @@ def candidates(
 
 
 def _follow(model: mujoco.MjModel, machine: Machine, joints: Sequence[Joint]) -> list[Joint]:
-    """Joints that nothing measures or drives, and that closed chains make follow those that are measured."""
-    driven = {actuator.joint.name for actuator in machine.actuators if actuator.joint}
+    """Joints that nothing measures, and that closed chains make follow those that are measured."""
     tied = dependent_joints(model, {model.joint(joint.name).id for joint in joints})
-    return [j for j in machine.joints if model.joint(j.name).id in tied and not j.base and j.name not in driven]
+    return [j for j in machine.joints if model.joint(j.name).id in tied and not j.base]
 
 
 def _shared_by_rotors(
