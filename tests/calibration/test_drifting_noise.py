@@ -1,4 +1,4 @@
-"""Noise that remembers as long as the logs are is told: the fit then follows changes alone."""
+"""Noise whose correlation time is as long as the logs is told: the fit then follows changes, mostly."""
 
 from __future__ import annotations
 
