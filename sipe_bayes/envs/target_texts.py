@@ -89,6 +89,7 @@ TARGET_TEXTS: dict[str, dict[str, str]] = {
         "command_limit": "largest command either way",
         "lag": 's; time constant of an actuator with `dyntype="filterexact"` or `"filter"`, or of a dcmotor\'s current',
         "force_drop": "share of the force that is lost for each unit of it; a law",
+        "dead_zone": "force up to which nothing arrives, either way, and of more only the rest; a law",
         "supply_sag": "share of the force that is lost for each unit of the forces of all actuators; a law",
     },
     "geom": {

@@ -90,8 +90,9 @@ def _with_what_is_lacking(parameter: ParameterSummary, findings: Findings) -> Ve
     """How far the wider interval determines a parameter."""
     if _wide(parameter):
         return Verdict("bad", "not determined")
-    doubted = "; doubted above" if _doubts(findings, [parameter]) else ""
-    return Verdict("fair", "within the wider interval" + doubted)
+    if _doubts(findings, [parameter]):
+        return Verdict("fair", "determined; doubted above")  # no interval is to be used yet
+    return Verdict("fair", "within the wider interval")
 
 
 def _wide(parameter: ParameterSummary, contraction: float = THRESHOLDS.not_determined) -> bool:

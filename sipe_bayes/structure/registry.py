@@ -44,6 +44,7 @@ EXTENSIONS: dict[str, str] = {  # name: module and class
     "force_limit": "actuator.force_limit:ForceLimit",
     "command_limit": "actuator.command_limit:CommandLimit",
     "force_drop": "actuator.force_drop:ForceDrop",
+    "dead_zone": "actuator.dead_zone:DeadZone",
     "cogging": "actuator.cogging:Cogging",
     "gain": "actuator.gain:Gain",
     "log_gain": "actuator.log_gain:LogGain",

@@ -36,6 +36,7 @@ NUMBERS = {  # bounds of each number of a law: large against the machines' force
     "cogging_cos": (-0.5, 0.5),
     "cogging_poles": (1.0, 12.0),
     "force_drop": (-0.2, 0.2),
+    "dead_zone": (0.0, 0.5),
     **dict.fromkeys(Residual.scales, (0.3, 2.0)),
     **{number.attribute: (-0.3, 0.3) for number in Residual.numbers[3:]},
 }
@@ -81,6 +82,7 @@ def plain_value(
         "hysteresis": lambda: -p[0] * sum(memory) / 3,
         "supply_sag": lambda: -force * min(p[0] * total, 1.0),
         "force_drop": lambda: -p[0] * force * abs(force),
+        "dead_zone": lambda: -max(-p[0], min(p[0], force)),
     }
     return float(values[name]())
 

@@ -19,8 +19,9 @@ _BETTER, _CLEAR = np.log(1.3), 3.0  # of the same, where the model names a zero;
 _BELIEVED = 0.3  # of the miss of one channel, up to which it has no zero that is looked for
 _FITTED = 3  # zeros with which the unknowns are fitted, those that miss least
 _GRID, _FINER = 31, 9  # zeros that are tried over the range of a joint, and twice around the best
+_ROUNDS = 4  # of zero and unknowns, each with the other
 _UNSURE = 2.0  # steps of the grid, by which a zero may be off that simulations alone tell
-_AFFORDED, _FEWER = 1_000_000, 12  # physics steps of all grids, about 20 s with a dozen joints; and windows beyond
+_AFFORDED, _FEWER = 2_000_000, 12  # physics steps of all grids, about 40 s with a dozen joints; and windows beyond
 _FIT_AFFORDED = 170_000  # of a round of a fit
 _NONE = 1e-6  # rad or m
 
@@ -87,13 +88,18 @@ def _afforded(case: Case, joints: list[int], near: Sequence[Readings]) -> tuple[
     """Joints whose zeros a grid is simulated for, and those for which there is no time."""
     if _costs_little(case, joints, near):
         return joints, []
-    count = max(1, _AFFORDED // (2 * (_GRID + 2 * _FINER) * case.trial.thinned(_FEWER).steps))
+    count = max(1, _AFFORDED // (_simulated(near[:1]) * case.trial.thinned(_FEWER).steps))
     return joints[:count], joints[count:]
 
 
 def _costs_little(case: Case, joints: Sequence[int], near: Sequence[Readings]) -> bool:
     """Whether grids of all the joints are simulated with all windows."""
-    return 2 * len(near) * len(joints) * (_GRID + 2 * _FINER) * case.trial.steps <= _AFFORDED
+    return len(joints) * _simulated(near) * case.trial.steps <= _AFFORDED
+
+
+def _simulated(near: Sequence[Readings]) -> int:
+    """How often windows are simulated for a joint: with both signs, with and without its set-point, by both cases."""
+    return 2 * (4 * len(near) * _GRID + 2 * _FITTED * _FINER)
 
 
 def _measures(reading: Reading, joint: Joint) -> bool:
@@ -107,6 +113,9 @@ def _nearest(case: Case, ranking: Ranking | None) -> list[Readings]:
         return [case.draft.readings]
     best = answered(case.draft.readings, asked, ranking.answers[int(np.argmin(ranking.scores))])
     return [best, *([case.draft.readings] if best != case.draft.readings else [])]
+
+
+Tried = list[tuple[float, _Zero, Readings]]  # zeros with the readings that have them, and what these miss
 
 
 @dataclass(frozen=True)
@@ -143,7 +152,7 @@ def _first_better(
     cases = [case, replace(case, theta=now.theta)]
     searched = _searched if _costs_little(case, [*unlike], near) else _searched_soon
     for zeros_of, of in ((_named, joints), (searched, unlike)):
-        tried: list[tuple[float, _Zero, Readings]] = []
+        tried: Tried = []
         for n, (k, joint) in enumerate(of.items()):
             case.tell(f"{n} of {len(of)} joints")
             tried += [one for one in zeros_of(cases, model, k, joint, near) if one[0] < now.missed.mean()]
@@ -152,11 +161,30 @@ def _first_better(
         if not after:
             continue
         zero, then = min(after, key=lambda one: float(one[1].missed.mean()))
+        if not zero.why:
+            zero, then = _refined(case, zero, then)
         better = now.missed - then.missed
         error = float(better.std()) / np.sqrt(len(better))
         if better.mean() > max(_BETTER if zero.why else _FAR_BETTER, _CLEAR * error):
             return zero, then
     return None
+
+
+def _refined(case: Case, zero: _Zero, now: _Fitted) -> tuple[_Zero, _Fitted]:
+    """A zero of a grid looked for once more around itself, and the unknowns fitted anew, as long as that is better.
+
+    The grid was simulated with unknowns that had been fitted without it.
+    """
+    for _ in range(_ROUNDS):
+        around = zero.value + zero.unsure * np.linspace(-1, 1, 2 * _FINER - 1)
+        zeros = [replace(zero, value=float(value)) for value in around]
+        sets: list[Readings] = [one.put(now.readings) for one in zeros]
+        best = int(np.argmin(_missed([replace(case, theta=now.theta)], sets)))
+        then = _fitted(case, sets[best])
+        if not then.missed.mean() < now.missed.mean():
+            break
+        zero, now = zeros[best], then
+    return zero, now
 
 
 def _missed(cases: Sequence[Case], sets: Sequence[Readings]) -> FloatArray:
@@ -166,9 +194,6 @@ def _missed(cases: Sequence[Case], sets: Sequence[Readings]) -> FloatArray:
     trial = cases[0].trial
     each = [np.concatenate([trial.missed(part, case.theta).mean(1) for part in parts]) for case in cases]
     return np.asarray(np.min(each, axis=0))
-
-
-Tried = list[tuple[float, _Zero, Readings]]
 
 
 def _named(cases: Sequence[Case], model: mujoco.MjModel, k: int, joint: Joint, near: Sequence[Readings]) -> Tried:
@@ -202,21 +227,26 @@ def _searched(cases: Sequence[Case], model: mujoco.MjModel, k: int, joint: Joint
     case = cases[0]
     channel, step = case.layout.channels[k][0], (high - low) / (_GRID - 1)
     usual = float(np.median(np.concatenate([log.observations[:, channel] for log in case.trial.logs])))
-    best: list[tuple[float, _Zero, Readings]] = []
-    for places in _places(case, k, joint):
-        for readings in near:
-            middle = usual * scale_of(readings[k]) / scale_of(case.draft.readings[k])
-            values, width = middle - np.linspace(low, high, _GRID), step
-            for _ in range(3):
-                if joint.hinge and not model.jnt_limited[own.id]:
-                    values = (values + np.pi) % (2 * np.pi) - np.pi
-                zeros = [_Zero(places, float(v), "", _UNSURE * step) for v in values]
-                sets: list[Readings] = [zero.put(readings) for zero in zeros]
-                misses = _missed(cases[-1:], sets)
-                i = int(np.argmin(misses))
-                best.append((float(misses[i]), zeros[i], sets[i]))
-                values, width = values[i] + width * np.linspace(-1, 1, _FINER), 2 * width / (_FINER - 1)
-    return [min(best, key=lambda one: one[0])]
+    wraps = joint.hinge and not model.jnt_limited[own.id]
+
+    def best(values: FloatArray, places: tuple[int, ...], readings: Readings) -> tuple[float, _Zero, Readings]:
+        values = (values + np.pi) % (2 * np.pi) - np.pi if wraps else values
+        zeros = [_Zero(places, float(v), "", _UNSURE * step) for v in values]
+        sets: list[Readings] = [zero.put(readings) for zero in zeros]
+        misses = _missed(cases, sets)
+        i = int(np.argmin(misses))
+        return float(misses[i]), zeros[i], sets[i]
+
+    coarse: Tried = []
+    for readings in (_signed(each, k, sign) for each in near for sign in (each[k].sign, turned(each[k].sign))):
+        middle = usual * scale_of(readings[k]) / scale_of(case.draft.readings[k])
+        coarse += [best(middle - np.linspace(low, high, _GRID), p, readings) for p in _places(case, k, joint)]
+    fine: Tried = []
+    for one in sorted(coarse, key=lambda one: one[0])[:_FITTED]:
+        for width in (step, 2 * step / (_FINER - 1)):
+            one = best(one[1].value + width * np.linspace(-1, 1, _FINER), one[1].places, one[2])
+        fine.append(one)
+    return fine
 
 
 def _searched_soon(
@@ -224,8 +254,9 @@ def _searched_soon(
 ) -> Tried:
     """The same of few windows, and of the best units and signs alone."""
     few = [replace(case, trial=case.trial.thinned(_FEWER)) for case in cases]
-    (_, zero, readings), *_ = _searched(few, model, k, joint, near[:1])
-    return [(float(_missed(cases[-1:], [readings])[0]), zero, readings)]
+    tried = _searched(few, model, k, joint, near[:1])
+    misses = _missed(cases, [readings for _, _, readings in tried]).tolist()
+    return [(miss, zero, readings) for miss, (_, zero, readings) in zip(misses, tried, strict=True)]
 
 
 def _places(case: Case, k: int, joint: Joint) -> list[tuple[int, ...]]:

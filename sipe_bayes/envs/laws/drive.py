@@ -2,6 +2,7 @@ r"""Forces of motors that MJCF has no element for.
 
 - ``cogging``: a force a sin(n q) + b cos(n q).
 - ``force_drop``: the actuator's force falls short by p f \|f\|.
+- ``dead_zone``: of the actuator's force up to d, either way, nothing arrives, and of more the rest.
 - ``supply_sag``: it falls short by p f F, with F the forces of all actuators on one supply, added up by size: their
   currents lower the voltage that each of them gets.
 """
@@ -39,6 +40,18 @@ class ForceDrop(Law):
     def value(self, now: Now) -> FloatArray:
         """-p f |f|."""
         return -now.numbers[:, 0] * now.sensed * np.abs(now.sensed)
+
+
+class DeadZone(Law):
+    """An actuator of whose force the first bit moves nothing."""
+
+    name, kind, senses, friction = "dead_zone", "actuator", "force", False
+    numbers = (Number("dead_zone", "force", minimum=0.0),)
+
+    def value(self, now: Now) -> FloatArray:
+        """-min(max(f, -d), d)."""
+        width = now.numbers[:, 0]
+        return -np.clip(now.sensed, -width, width)
 
 
 class SupplySag(Law):

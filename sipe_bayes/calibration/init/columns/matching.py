@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -44,6 +44,7 @@ def match_columns(machine: Machine, table: Table) -> Matches:
     vectors, labels = match_vectors(machine, labels)
     vectors, open_vectors = held_open(vectors)
     labels = _called_as_actuators(machine, _called_as_joints(machine, labels), _SAYS_NOTHING)
+    unnamed = {label.column for label in labels if label.kind == Kind.UNKNOWN}
     labels, open_commands = _unravelled(machine, labels, table)
     offsets = _ordinals(labels)
     positions = _assigned(machine.joints, labels, Kind.POSITION, offsets)
@@ -53,11 +54,25 @@ def match_columns(machine: Machine, table: Table) -> Matches:
     commands, rivals = _commands(machine, _called_as_actuators(machine, over, _WANTED), offsets)
     forces = _forces(machine, labels, offsets, commands)
     used = {c for m in (*positions, *velocities, *commands, *vectors, *forces) for c in m.columns}
+    positions += _left_over(machine, positions, [x for x in labels if x.column not in used], unnamed)
+    used |= {match.column for match in positions}
     left = tuple(name for name in table if name not in used)
     doubts = (*open_vectors, *open_commands)
     return Matches(
         tuple(positions), tuple(velocities), tuple(commands), tuple(vectors), tuple(rivals), left, doubts, tuple(forces)
     )
+
+
+def _left_over(
+    machine: Machine, positions: Sequence[Match], labels: Sequence[Label], unnamed: Collection[str]
+) -> list[Match]:
+    """The one column whose name says nothing, for the one joint that no column measures: pendel_winkel for a pivot."""
+    measured = {match.target for match in positions}
+    bare = [joint for joint in machine.joints if f"joint:{joint.name}.position" not in measured]
+    labels = [label for label in labels if label.column in unnamed]
+    if not positions or not len(bare) == len(labels) == 1:
+        return []
+    return [Match((labels[0].column,), f"joint:{bare[0].name}.position", replace(labels[0], kind=Kind.POSITION), 0.0)]
 
 
 def _falls(values: FloatArray) -> bool:

@@ -207,3 +207,18 @@ def test_only_what_nothing_names_is_taken_by_order() -> None:
         m.target: m for m in matched(machine, [f"{name}_pos" for name in ("shoulder", "arm", "roll", "grip")]).positions
     }
     assert all(match.named for match in near.values())
+
+
+@pytest.mark.parametrize(
+    ("columns", "measured"),
+    [
+        (["u", "beam_deg", "kugel_weg"], ["beam_deg", "kugel_weg"]),
+        (["u", "beam_deg", "kugel_weg", "rinne"], ["beam_deg"]),  # either may
+        (["u", "beam_deg", "room_temp"], ["beam_deg"]),
+        (["u", "kugel_weg"], []),  # nothing tells that any joint is measured
+    ],
+)
+def test_the_one_column_left_measures_the_one_joint_left(columns: list[str], measured: list[str]) -> None:
+    matches = matched(Machine.of(mujoco.MjModel.from_xml_string(BEAM.format(kind="motor"))), columns)
+    assert [m.column for m in matches.positions] == measured
+    assert all(not m.sure for m in matches.positions if m.column == "kugel_weg")
