@@ -37,6 +37,7 @@ PLANTED = [
     Plant(
         "lag:motor", {"actuator:motor.lag": 0.05}, ("offset", "dry_friction"), edits=(FilteredCommand(("motor",), 0.6),)
     ),
+    Plant("dead_zone:motor", {"actuator:motor.dead_zone": 0.1}, ("direction_friction", "force_drop")),
     Plant(
         "presliding:hinge",
         {"joint:hinge.presliding_friction": 0.15, "joint:hinge.presliding_range": 0.05},

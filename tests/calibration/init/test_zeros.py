@@ -25,19 +25,25 @@ PENDULUM = """<mujoco><option timestep="0.004" integrator="implicitfast"/><world
   <body name="rod"><joint name="hinge" axis="0 1 0" damping="{damping}"/>
   <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".01" mass="{mass}"/></body></worldbody>
   <actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
+CRANE = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+  <body name="cart"><joint name="rail" type="slide" axis="1 0 0" damping="{damping}" frictionloss="{dry}"/>
+  <geom type="box" size=".1 .06 .04" mass="{cart}"/><body name="pendulum"><joint name="pivot" axis="0 -1 0"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.6" size=".006" mass=".21"/>
+  <geom size=".03" pos="0 0 -.6" mass="{bob}"/></body></body></worldbody>
+  <actuator><motor name="drive" joint="rail"/></actuator></mujoco>"""
 HEIGHT = "guide_height_m"
 
 
 def flown(text: str, start: float, commands: FloatArray, dt: float) -> FloatArray:
-    """Positions (n,) of a machine of one joint under commands (n,)."""
+    """Positions (n,) of a machine of one joint under commands (n,), or (n, J) of one of several."""
     model = mujoco.MjModel.from_xml_string(text)
     data, out = mujoco.MjData(model), []
     data.qpos[:] = start
     for command in commands:
-        out.append(float(data.qpos[0]))
+        out.append(data.qpos.copy())
         data.ctrl[:] = command
         mujoco.mj_step(model, data, nstep=round(dt / model.opt.timestep))
-    return np.array(out)
+    return np.squeeze(out)
 
 
 def hopper(folder: Path, ref: float = 0.0, floor: bool = True) -> Draft:
@@ -92,6 +98,30 @@ def test_the_zero_of_an_encoder_is_asked_for_where_simulations_alone_tell_it(tmp
     (tmp_path / "calibrate.toml").write_text(toml_of(draft, "sipe init"))
     problem = prepare(tmp_path / "calibrate.toml", 1)
     assert np.allclose(problem.train[0].observations[:5, 0], table["hinge_rad"][:5] - reading.zero, atol=1e-4)
+
+
+@pytest.mark.parametrize("zero", [137.3, -50.0])
+def test_the_zero_of_what_hangs_from_a_cart_that_the_model_has_wrong(tmp_path: Path, zero: float) -> None:
+    """Units and signs that were chosen without a zero are wrong ones, and no name says what the column is."""
+    logs, noise = [], np.random.default_rng(1)
+    for k in range(3):
+        time = np.arange(0, 20, 0.01)
+        force = sum(3.5 * np.sin((1.4 + 0.9 * k + 2.3 * j) * time + j) for j in range(3))
+        motion = flown(CRANE.format(damping=4.4, dry=1.1, cart=2.9, bob=0.6), 0.0, np.round(force, 2), 0.01)
+        table = {
+            "zeit_ms": 1e3 * time,
+            "kat_pos_mm": 1e3 * motion[:, 0] + noise.normal(0, 0.05, len(time)),
+            "winkel": np.round((np.degrees(motion[:, 1]) + zero) / 0.18) * 0.18,
+            "kraft_soll_N": np.round(force, 2),
+        }
+        pd.DataFrame(table).round(4).to_csv(tmp_path / f"log{k}.csv", index=False)
+        logs.append(tmp_path / f"log{k}.csv")
+    (tmp_path / "crane.xml").write_text(CRANE.format(damping=1.0, dry=0.5, cart=2.0, bob=0.45))
+    by_target = {r.match.target: r for r in propose(tmp_path / "crane.xml", logs, tmp_path).measurements}
+    angle = by_target["joint:pivot.position"]
+    print(angle.zero, angle.sign, angle.unit)
+    assert (angle.match.column, angle.sign, angle.unit) == ("winkel", 1, "deg")
+    assert abs(angle.zero - zero) < 3
 
 
 def test_a_column_that_nothing_follows_is_named_before_a_fit(tmp_path: Path) -> None:
