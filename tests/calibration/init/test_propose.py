@@ -51,7 +51,7 @@ def test_units_signs_and_delays_of_eight_logs(tmp_path: Path) -> None:
     for seed, (kind, variant) in enumerate(LOGS):
         folder = tmp_path / f"{kind}{variant}"
         folder.mkdir()
-        truth = make_log(folder, KINDS[kind], variant, seed, steps=700)
+        truth = make_log(folder, KINDS[kind], variant, seed, steps=450)
         draft = propose(folder / "model.xml", [folder / "log.csv"], folder)
         (folder / "calibrate.toml").write_text(toml_of(draft, "sipe init"))
         config = load_config(folder / "calibrate.toml")
@@ -88,7 +88,7 @@ def test_samples_that_are_missing_hide_nothing(tmp_path: Path) -> None:
 
 def test_angles_against_the_world_are_told_from_those_of_joints(tmp_path: Path) -> None:
     """As a camera sees a chain of links, both columns turned round; a joint's own angle is none, nor a difference."""
-    truth = make_log(tmp_path, KINDS["arm"], 0, 5)
+    truth = make_log(tmp_path, KINDS["arm"], 0, 20, steps=500)
     assert {truth.columns[q, f"joint:{joint}.position"][1] for q, joint in (("q1", "shoulder"), ("q2", "elbow"))} == {
         -1
     }
@@ -115,7 +115,7 @@ def test_where_nothing_shows_all_is_asked_for(tmp_path: Path) -> None:
 def arm(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A folder with an arm's model and log, and the configuration that is written for them."""
     folder = tmp_path_factory.mktemp("arm")
-    make_log(folder, KINDS["arm"], 1, 1)
+    make_log(folder, KINDS["arm"], 1, 6, steps=600)
     result = CliRunner().invoke(app, init_of(folder))
     assert result.exit_code == 0, result.output
     assert result.output.count("\n") <= 20
@@ -233,7 +233,7 @@ def test_what_a_chain_ties_to_a_velocity_alone_starts_where_the_model_does(
     tmp_path: Path, measured: str, blind: bool
 ) -> None:
     (tmp_path / "model.xml").write_text(TIED)
-    time = 0.01 * np.arange(300)
+    time = 0.01 * np.arange(150)
     columns = {"time": time, "hinge_position": 0.3 * np.cos(4 * time), f"crank_{measured}": 0.2 * np.sin(4 * time)}
     pd.DataFrame(columns).to_csv(tmp_path / "log.csv", index=False)
     draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)

@@ -31,7 +31,7 @@ SENSOR = '<sensor><gyro name="gyro" site="tip"/></sensor>'
 TURN, DT = 2 * np.pi, 0.01
 
 
-def moved(gravity: float, steps: int = 900) -> dict[str, FloatArray]:
+def moved(gravity: float, steps: int = 500) -> dict[str, FloatArray]:
     """Time, commands in rad/s, positions in rad and rates in rad/s of a boom that goes to and fro."""
     model = mujoco.MjModel.from_xml_string(BOOM.format(gravity=gravity, sensor=SENSOR))
     data, rows = mujoco.MjData(model), []
