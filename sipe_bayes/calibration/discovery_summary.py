@@ -122,7 +122,7 @@ def _untried(structures: Structures) -> str:
     """Pieces that a search whose budget was spent did not try, or not to the end, in words."""
     state, search = structures.state, structures.search
     if state.cut is Phase.FIT:
-        names = [search.placed[label].sentence for label in state.queue]
+        names = [search.placed[label].sentence for label in state.queue if label not in structures.best.labels]
     elif state.cut in (Phase.COLUMNS, Phase.RANK):
         names = [one.sentence for one in search.placed.values() if one.label not in state.present]
     else:

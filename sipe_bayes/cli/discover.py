@@ -111,7 +111,9 @@ def lines_of(discovery: Discovery) -> list[str]:
     tried = [f"{'nats over the model as it was':60}{'evidence':>9}{'held out':>9}{'probability':>12}"]
     for one in discovery.rows:
         cells = f"{nats(one.evidence):>9}{nats(one.held_out):>9}{chance(one):>12}"
-        tried.append(f"  {structure_text(one):58.58}{cells}")
+        text = structure_text(one)
+        text = text if len(text) <= _WIDTH else " + ".join(one.labels)  # cut off, several would read alike
+        tried.append(f"  {text:{_WIDTH}.{_WIDTH}}{cells}")
     lines += _cut(tried, _TRIED)
     errors = [error for error in discovery.errors if error.use == "holdout"] or list(discovery.errors)
     lines += _cut([f"{error.use} {error_line(error)}" for error in errors], _ERRORS)

@@ -235,8 +235,8 @@ class Code(Enum):
     )
     AT_PHYSICAL_BOUND = Text(
         Severity.NOTE,
-        "{parameters} is at {bound:.4g}{unit}, and can not be smaller: the logs show none of it up to the upper end "
-        "of its interval",
+        "{parameters} is at {bound:.4g}{unit}, and can not be smaller: in this model the logs show none of it up to "
+        "the upper end of its interval",
         "none shows",
     )
     RIDGE = note(_RIDGE + "is determined; {alone} not")

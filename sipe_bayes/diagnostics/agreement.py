@@ -60,6 +60,7 @@ class Disagreement:
         unit: of the parameter.
         odd: the log without which the others agree best, where they do at the same level.
         p_without: how well they agree without it.
+        bounds: of the parameter, in its unit: a log that asks for a value beyond them lacks something else.
     """
 
     p: float
@@ -69,12 +70,19 @@ class Disagreement:
     unit: str = ""
     odd: str | None = None
     p_without: float = 0.0
+    bounds: tuple[float, float] = (-math.inf, math.inf)
 
     @property
     def finding(self) -> Finding:
         """It as a finding about the parameter."""
         unexplained = self.p_left < THRESHOLDS.logs_disagree
-        says = ", ".join(f"{log} says {value:.4g} ± {sd:.2g}" for log, value, sd in self.per_log)
+        low, high = self.bounds
+        beyond = [value + sd < low or value - sd > high for _, value, sd in self.per_log]
+        marks = [" (beyond its bounds)" if out else "" for out in beyond]
+        says = ", ".join(
+            f"{log} says {value:.4g} ± {sd:.2g}{mark}"
+            for (log, value, sd), mark in zip(self.per_log, marks, strict=True)
+        )
         estimates = f"{says} {self.unit}".rstrip()
         most = f"{self.parameter} differs most ({estimates})" if says else "only combinations of parameters differ"
         return finding(
@@ -225,7 +233,7 @@ def disagreement(space: ParameterSpace, logs: Sequence[LogEstimate]) -> Disagree
     best = max(range(len(logs)), key=lambda k: left_out[k].p if left_out[k].freedom else -1.0)
     agree = left_out[best].freedom > 0 and left_out[best].p > THRESHOLDS.logs_disagree
     odd = (logs[best].name, left_out[best].p) if agree else (None, 0.0)
-    return Disagreement(together.p, parameter.name, p_left, tuple(per_log), parameter.unit, *odd)
+    return Disagreement(together.p, parameter.name, p_left, tuple(per_log), parameter.unit, *odd, (parameter.low, parameter.high))
 
 
 def _by_themselves(logs: Sequence[LogEstimate], shared: Sequence[int]) -> tuple[int, _Own]:

@@ -62,6 +62,7 @@ _LARGEST_BIAS = {"accelerometer": 1.0, "gyro": 0.2}  # m/s^2, rad/s
 _BLIND = 0.5  # s, windows where nothing tells how fast the machine moves
 _TURNING = 24  # windows of the fit of what turns freely: contacts take their time
 _ROUNDS = 20  # of the fit of unknowns: with dry friction and a delay 12 end far from the optimum, at another delay
+_SPARE = 3  # columns that are not used, of which names are told
 _SHORT = 2.0  # s: logs as short are one window each
 
 
@@ -199,7 +200,9 @@ def _unmatched(model: mujoco.MjModel, machine: Machine, matches: Matches, comman
     blind += [pose for j in posed for pose in _poses(model, j) if f"body:{pose}" not in measured]
     unnamed = sum(not has_pose(model, j) and not model.joint(j).name for j in range(model.njnt))
     if blind:
-        out.append(f"no column measures {', '.join(blind)}: windows start it where the model does")
+        spare = ", ".join(map(repr, matches.left[:_SPARE]))
+        unused = f" (not used: {spare}{', ...' if len(matches.left) > _SPARE else ''})" if spare else ""
+        out.append(f"no column measures {', '.join(blind)}{unused}: windows start it where the model does")
     if unnamed:
         out.append(f"{unnamed} joints have no name; give them one in the MJCF, so that they can be measured")
     return out

@@ -17,7 +17,7 @@ class ForceDrop(Extension):
 
     def sentence(self, site: str) -> str:
         """What it is."""
-        return f"a gain of {site} that falls with its force"
+        return f"a gain of {site} that changes with its force"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """Up to a half at twice the usual force."""
