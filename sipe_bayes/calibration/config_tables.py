@@ -229,6 +229,8 @@ class LogEntry(Table):
     """`[start, stop]` in seconds from the first sample; default all"""
     window: Window = None
     """overrides `window` for this log; with `"state_space"`, over what a held-out log is scored (default 0.5 s)"""
+    added: dict[Text, Number] = Field(default_factory=dict)
+    """kg that this log, to train on or held out, has more than the model: `{"body:load.mass" = 3.0}` of a known load"""
 
     @model_validator(mode="before")
     @classmethod
@@ -260,10 +262,8 @@ def _matched(logs: tuple[LogEntry, ...], info: ValidationInfo) -> tuple[LogEntry
         files = matching(log.file, (info.context or {}).get("folder", Path()))
         if not files:
             raise problem(f"no file matches {log.file}; correct the pattern", i, "file")
-        if files == [log.file]:
-            entries.append(log)
-            continue
         names = names_of(files) if log.name == log.file.stem else [f"{log.name}-{k}" for k in range(len(files))]
+        names = [log.name] if files == [log.file] else names
         entries += [log.model_copy(update={"file": f, "name": name}) for f, name in zip(files, names, strict=True)]
     return tuple(entries)
 

@@ -25,6 +25,7 @@ from sipe_bayes.core.units import find_unit, to_si
 from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.diagnostics.misfit.tolerances import Tolerances
 from sipe_bayes.diagnostics.records import LogReport
+from sipe_bayes.envs.added import of_logs
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.foreign.load import ModelError
 from sipe_bayes.envs.laws.firmware import Firmware
@@ -113,7 +114,7 @@ def prepare(config: Config | str | Path, num_threads: int | None = None, device:
     """
     config = config if isinstance(config, Config) else load_config(config)
     train_logs, held_logs = config.logs_for("train"), config.logs_for("holdout")
-    environment = environment_of(config, train_logs)
+    environment = environment_of(config, train_logs, held_logs)
     units = dict(zip(environment.channels, environment.channel_units, strict=True))
     dimensions = {
         m.target: "dimensionless" if m.quaternion else _dimension(units[m.channels[0][1]]) for m in config.measurements
@@ -164,8 +165,11 @@ def _dimension(unit: str) -> str:
         return ""
 
 
-def environment_of(config: Config, train: Sequence[LogEntry]) -> MjcfEnvironment:
-    """A configuration's model and parameters; raises ConfigError, TargetError or ModelError for what does not fit."""
+def environment_of(config: Config, train: Sequence[LogEntry], held: Sequence[LogEntry] = ()) -> MjcfEnvironment:
+    """A configuration's model and parameters, with what is added in logs.
+
+    Raises ConfigError, TargetError or ModelError for what does not fit.
+    """
     parameters: list[Parameter] = []
     # the unit of a command offset is the command's; other units are the model's own (empty here)
     units = {f"{c.target}.offset": to_si(c.unit)[1] for c in config.commands}
@@ -189,8 +193,9 @@ def environment_of(config: Config, train: Sequence[LogEntry]) -> MjcfEnvironment
     channels = [Channel(*channel) for m in config.measurements for channel in m.channels]
     edits = [Firmware(c.actuator, c.rate, c.fed.actuator if c.fed else "") for c in config.commands if c.rate]
     actuators = [c.actuator for c in config.commands]
+    added = of_logs([(log.name, log.added) for log in (*train, *held)])
     try:
-        environment = MjcfEnvironment.build(config.model, parameters, actuators, channels, edits)
+        environment = MjcfEnvironment.build(config.model, parameters, actuators, channels, edits, added)
     except (TargetError, ModelError):
         raise
     except ValueError as error:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from sipe_bayes.diagnostics.discovery import Discovery
     from sipe_bayes.inference.recorded import Progress
 
+_WIDTH = 58  # of what a structure has
 _TRIED, _ERRORS, _VALUES = 5, 2, 3  # lines of each kind that are printed: twenty in all
 _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 

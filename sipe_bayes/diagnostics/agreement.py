@@ -232,8 +232,9 @@ def disagreement(space: ParameterSpace, logs: Sequence[LogEstimate]) -> Disagree
     left_out = [_scatter(roots[:k] + roots[k + 1 :], sought[:k] + sought[k + 1 :]) for k in range(len(logs))]
     best = max(range(len(logs)), key=lambda k: left_out[k].p if left_out[k].freedom else -1.0)
     agree = left_out[best].freedom > 0 and left_out[best].p > THRESHOLDS.logs_disagree
-    odd = (logs[best].name, left_out[best].p) if agree else (None, 0.0)
-    return Disagreement(together.p, parameter.name, p_left, tuple(per_log), parameter.unit, *odd, (parameter.low, parameter.high))
+    odd, without = (logs[best].name, left_out[best].p) if agree else (None, 0.0)
+    bounds = parameter.low, parameter.high
+    return Disagreement(together.p, parameter.name, p_left, tuple(per_log), parameter.unit, odd, without, bounds)
 
 
 def _by_themselves(logs: Sequence[LogEstimate], shared: Sequence[int]) -> tuple[int, _Own]:

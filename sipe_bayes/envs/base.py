@@ -86,6 +86,11 @@ class Environment(ABC):
         return np.zeros(len(self.space))
 
     @property
+    def by_log(self) -> bool:
+        """Whether logs differ in their model: in a parameter of one log alone. If not, they share their models."""
+        return any(parameter.log is not None for parameter in self.space)
+
+    @property
     def needs_constants(self) -> bool:
         """Whether mj_setConst must follow ``write``."""
         return True

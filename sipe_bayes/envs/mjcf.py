@@ -19,6 +19,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.envs.added import Added, AddedValues, check_added
 from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.channels import (
     Channel,
@@ -33,6 +34,7 @@ from sipe_bayes.envs.channels import (
 )
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 from sipe_bayes.envs.inertia import check_inertia, restore_inertia
+from sipe_bayes.envs.internal.of_logs import mean_over, standing_for
 from sipe_bayes.envs.internal.states import filtered_command, filtered_commands, start_sd
 from sipe_bayes.envs.laws.base import LawError
 from sipe_bayes.envs.laws.bound import declare, laws_of, moving_on
@@ -66,6 +68,7 @@ class MjcfEnvironment(Environment):
         measurements: what the columns of ``observations`` are.
         parameters: the unknowns.
         edits: what is changed in the MJCF before it is compiled.
+        added: what single logs have more than the model.
     """
 
     source: str
@@ -73,6 +76,7 @@ class MjcfEnvironment(Environment):
     measurements: tuple[Channel, ...]
     parameters: ParameterSpace
     edits: tuple[Edit, ...] = ()
+    added: tuple[Added, ...] = ()
 
     @classmethod
     def build(
@@ -82,6 +86,7 @@ class MjcfEnvironment(Environment):
         actuators: Sequence[str],
         measurements: Sequence[str | Channel],
         edits: Sequence[Edit] = (),
+        added: Iterable[Added] = (),
     ) -> MjcfEnvironment:
         """Check everything against the model and fill in units and defaults.
 
@@ -93,6 +98,7 @@ class MjcfEnvironment(Environment):
             measurements: what the log holds; a text stands for a channel with that target, and the target of a
                 body's vector or of an orientation for its three channels.
             edits: what is changed in the MJCF before it is compiled.
+            added: what single logs have more than the model, where that is known.
 
         Raises:
             ModelError: for an MJCF that does not compile.
@@ -117,7 +123,7 @@ class MjcfEnvironment(Environment):
         rotation_triples(channels)
         space = ParameterSpace(with_model_values(model, p, channels) for p in parameters)
         check_conflicts(space)
-        return cls(str(source), tuple(actuators), channels, space, tuple(edits))
+        return cls(str(source), tuple(actuators), channels, space, tuple(edits), check_added(model, added))
 
     @property
     def space(self) -> ParameterSpace:  # type: ignore[override]
@@ -161,7 +167,7 @@ class MjcfEnvironment(Environment):
         return self.compile()
 
     def __getstate__(self) -> dict[str, object]:
-        return {f: getattr(self, f) for f in ("source", "actuators", "measurements", "parameters", "edits")}
+        return {f: getattr(self, f) for f in ("source", "actuators", "measurements", "parameters", "edits", "added")}
 
     def __setstate__(self, state: dict[str, object]) -> None:
         self.__dict__.update(state)
@@ -204,21 +210,19 @@ class MjcfEnvironment(Environment):
         return {}
 
     def _resolve(self, log: str | None) -> dict[int, list[int]]:
-        """Parameter -> the parameters whose mean it takes in ``log``; absent when it does not apply there.
-
-        A nuisance parameter of a log that was not calibrated takes the mean over the logs that were.
-        """
+        """Parameter -> the parameters whose mean it takes in ``log``; absent when it does not apply there."""
         if log not in self._shares:
-            groups: dict[tuple[str, ...], list[int]] = {}
-            for j, p in enumerate(self.parameters):
-                if p.log is not None:
-                    groups.setdefault(p.targets, []).append(j)
-            table = {j: [j] for j, p in enumerate(self.parameters) if p.log is None or p.log == log}
-            for members in groups.values():
-                if not any(self.parameters[j].log == log for j in members):
-                    table[members[0]] = members
-            self._shares[log] = table
+            self._shares[log] = standing_for(self.parameters, log)
         return self._shares[log]
+
+    @cached_property
+    def _more(self) -> AddedValues:
+        return AddedValues(self._model, self.added, self.parameters)
+
+    @property
+    def by_log(self) -> bool:
+        """See ``Environment.by_log``; what is added in a log differs too."""
+        return bool(self.added) or super().by_log
 
     def write(self, model: mujoco.MjModel, values: FloatArray, log: str | None = None) -> bool:
         """Write all targets of the parameters that apply in ``log``; see ``Environment.write``."""
@@ -228,9 +232,11 @@ class MjcfEnvironment(Environment):
             restore_inertia(model, self._model, bodies)
         for j, multiplier, target in self._targets:
             if j in table:
-                value = multiplier * _mean(values, table[j])
+                value = multiplier * mean_over(values, table[j]) + self._more.to(target, log)
                 physical &= value >= target.minimum
                 target.write(model, value)
+        for target in self._more.unwritten:
+            target.write(model, target.value + self._more.to(target, log))
         return physical and (not bodies or check_inertia(model, bodies))
 
     def start_sd(self, model: mujoco.MjModel) -> FloatArray:
@@ -250,7 +256,7 @@ class MjcfEnvironment(Environment):
     @property
     def needs_constants(self) -> bool:
         """Whether MuJoCo's derived constants depend on any of the parameters."""
-        return any(t.constants for _, _, t in self._targets)
+        return bool(self.added) or any(t.constants for _, _, t in self._targets)
 
     def bias(self, values: FloatArray, log: str | None = None) -> FloatArray:
         """The sensor biases among the parameters, as they hold in ``log``."""
@@ -263,9 +269,9 @@ class MjcfEnvironment(Environment):
         out, table = Sensing.of_bias(np.zeros(len(self.measurements))), self._resolve(log)
         for j, attribute, channels in self._sensed:
             if j in table and attribute == "scale":
-                out.scale[channels] *= _mean(values, table[j])
+                out.scale[channels] *= mean_over(values, table[j])
             elif j in table:
-                getattr(out, attribute)[channels] += _mean(values, table[j])
+                getattr(out, attribute)[channels] += mean_over(values, table[j])
         return out
 
     @cached_property
@@ -384,10 +390,6 @@ def _prepared(
             if (kind, attribute) in LAW_OF and owner is not None and owner(name) is not None:
                 declare(spec, kind, name, LAW_OF[kind, attribute][0])
     return spec
-
-
-def _mean(values: FloatArray, members: list[int]) -> float:
-    return float(values[members[0]] if len(members) == 1 else np.mean(values[members]))
 
 
 def _controls_of(model: mujoco.MjModel, actuators: Sequence[str]) -> list[int]:

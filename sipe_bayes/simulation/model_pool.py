@@ -50,7 +50,7 @@ class ModelPool:
         Returns:
             The slot of each, (B,).
         """
-        named = np.array(logs if self._by_log else [None] * len(theta), object)
+        named = np.array(logs if self.environment.by_log else [None] * len(theta), object)
         differs = (theta[1:] != theta[:-1]).any(1) | (timesteps[1:] != timesteps[:-1]) | (named[1:] != named[:-1])
         first = np.flatnonzero(np.concatenate([[True], differs | own]))
         index: dict[bytes, int] = {}
@@ -118,11 +118,6 @@ class ModelPool:
         model = copy.copy(self.model) if model is None else model
         self._write(model, self._values(theta[None])[0], float(self.model.opt.timestep), None)
         return model
-
-    @cached_property
-    def _by_log(self) -> bool:
-        """Whether a parameter is one log's: without, the logs share their models."""
-        return any(parameter.log is not None for parameter in self.environment.space)
 
     @cached_property
     def _trial(self) -> mujoco.MjModel:

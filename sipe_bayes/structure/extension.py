@@ -166,7 +166,9 @@ def extended(environment: MjcfEnvironment, placed: Sequence[Placed]) -> MjcfEnvi
     """
     edits = [*environment.edits, *(p.edit for p in placed if p.edit is not None)]
     parameters = [*environment.parameters, *(q for p in placed for q in p.parameters)]
-    return MjcfEnvironment.build(environment.source, parameters, environment.actuators, environment.measurements, edits)
+    return MjcfEnvironment.build(
+        environment.source, parameters, environment.actuators, environment.measurements, edits, environment.added
+    )
 
 
 def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
