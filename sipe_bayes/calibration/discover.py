@@ -19,7 +19,8 @@ from sipe_bayes.structure.discover import discover as search
 from sipe_bayes.structure.search import BUDGET, DiscoverOptions
 from sipe_bayes.structure.structures import Structures
 
-_KEYS = (*IDENTITY, "only", "without", "extensions_sha256")
+_KEYS = (*(key for key in IDENTITY if key != "budget"), "only", "without", "extensions_sha256")
+"""By which a search differs from others; with a larger budget it goes on."""
 
 
 def discover(
@@ -42,7 +43,8 @@ def discover(
         seed: default the configuration's.
         budget: rollouts of all fits; default the configuration's, then 30,000.
         options: of the search.
-        checkpoint: a file to go on from and to keep up to date; the same call goes on to the same bits.
+        checkpoint: a file to go on from and to keep up to date; the same call goes on to the same bits, and one with
+            a larger budget where the smaller one was spent.
         progress: called along the way.
 
     Returns:

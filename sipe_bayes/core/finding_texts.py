@@ -127,7 +127,7 @@ class Code(Enum):
     )
 
     STRUCTURES_CUT_SHORT = blocking(
-        "the budget of {budget} rollouts was spent before {before}{untried}: give --budget {larger} and another --out"
+        "the budget of {budget} rollouts was spent before {before}{untried}: give --budget {larger}, and the same folder goes on"
     )
     COLUMNS_UNTRIED = caution(
         "{count} signs and units of columns were not tried, for which a share of the budget of {budget} rollouts was "

@@ -95,7 +95,8 @@ def discover(
         options: of the search.
         budget: rollouts at most.
         seed: of the searches.
-        checkpoint: a file to go on from and to keep up to date; the same call goes on to the same bits.
+        checkpoint: a file to go on from and to keep up to date; the same call goes on to the same bits, and one with
+            a larger budget where the smaller one was spent.
         progress: called along the way.
 
     Raises:
@@ -110,9 +111,9 @@ def discover(
         state = load_state(checkpoint, DiscoverState, fingerprint)
     saved = -_SAVE_SECONDS
     while not state.done:
-        state = search.step(state)
+        before, state = state, search.step(state)
         if checkpoint is not None and (state.done or time.monotonic() - saved > _SAVE_SECONDS):
-            save_state(checkpoint, state, fingerprint)
+            save_state(checkpoint, before if state.cut else state, fingerprint)  # a larger budget takes that step anew
             saved = time.monotonic()
     search.place(state)
     return Structures(search, state)
@@ -204,7 +205,7 @@ def _fingerprint(search: StructureSearch, simulator: Simulator, restriction: Res
         "prior": [x.tolist() for x in fitting.prior.gaussian_moments()],
         "likelihood": repr(fitting.likelihood),
         "seed": fitting.seed,
-        "budget": search.budget,
+        "added": repr(fitting.environment.added),
         "options": search.options.plain(),
         "restriction": repr(restriction),
         "extensions": list(EXTENSIONS),

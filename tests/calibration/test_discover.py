@@ -288,6 +288,11 @@ def test_a_budget_that_ends_too_soon_is_said_and_what_to_give(tmp_path: Path) ->
     assert "of what was fitted" in texts[0]
     assert json.loads((tmp_path / "out" / "structures.json").read_text())["settled"] is False
     assert before in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    onward = run_discovery(config, tmp_path / "out", budget=3000, num_threads=1)
+    at_once = run_discovery(config, tmp_path / "other", budget=3000, num_threads=1)
+    assert onward.settled
+    assert [one.label for one in onward.kept] == ["dry_friction:hinge"]
+    assert [one.evidence for one in onward.kept] == pytest.approx([one.evidence for one in at_once.kept], rel=1e-2)
 
 
 def test_columns_that_were_not_tried_are_said(tmp_path: Path) -> None:

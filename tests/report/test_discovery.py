@@ -27,6 +27,11 @@ def changed(*pieces: Any, **changes: Any) -> Discovery:
     return dataclasses.replace(make_discovery(*pieces), **changes)
 
 
+def widened(discovery: Discovery) -> dict[str, Any]:
+    wider = [dataclasses.replace(p, further=(p.q05 - p.sd, p.q95 + p.sd)) for p in discovery.parameters]
+    return {"parameters": tuple(wider)}
+
+
 def left(misfit: Any) -> dict[str, Any]:
     return {"after": dataclasses.replace(make_discovery().after, misfit=misfit)}
 
@@ -85,7 +90,12 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
     "not trusted": (changed(FRICTION, **left(LARGE)), "bad", "No value may be trusted within its interval yet"),
     "unknown, not trusted": (changed(FRICTION, **left(None)), "bad", "No value may be trusted within its interval yet"),
     "not settled": (changed(FRICTION, settled=False), "bad", "raise its budget"),
-    "cut short": (changed(FRICTION, settled=False, findings=(CUT,)), "bad", "--budget 60000 and another --out"),
+    "cut short": (changed(FRICTION, settled=False, findings=(CUT,)), "bad", "--budget 60000, and the same folder"),
+    "cut short, wider": (
+        changed(FRICTION, settled=False, findings=(CUT,), **widened(make_discovery())),
+        "fair",
+        "Use values within the intervals",
+    ),
     "nothing tried": (changed(**left(LARGE), settled=False, findings=(CUT,)), "bad", "no piece was tried"),
 }
 
