@@ -30,6 +30,8 @@ from sipe_bayes.simulation.simulator import Simulator
 
 _FREE = 0  # mjJNT_FREE
 _DRAWS = 4000  # of the posterior: quantiles to one or two percent of an sd
+_CUT = 2e-3  # of the range, within which an interval ends at a bound
+_DIFFERENT = 0.1  # of the mean of the logs
 _NAMED = 3  # logs of what is summed up
 
 
@@ -119,6 +121,31 @@ class Marginals:
             summaries.append(ParameterSummary(p.name, p.unit, p.targets, *marginal, ends))
         return summaries
 
+    def cut_at_bounds(self, summaries: Sequence[ParameterSummary]) -> list[Finding]:
+        """Wider intervals that end at a bound which nature does not set, where the plain ones do not."""
+        noticed = []
+        for p, one in zip(self.space, summaries, strict=True):
+            ends = zip((p.low, p.high), one.further or (), (one.q05, one.q95), strict=False)
+            room = _CUT * (p.high - p.low)
+            cut = [bound for bound, far, near in ends if abs(far - bound) < room < abs(near - bound)]
+            for bound in [bound for bound in cut if not (bound == p.low and p.name in self.natural)]:
+                noticed.append(finding(Code.WIDER_AT_BOUND, parameters=[p.name], bound=bound, unit=_after(p.unit)))
+        return noticed
+
+    def means_of_logs(self) -> list[Finding]:
+        """What differs between logs by more than a tenth, of which others and the written model have the mean."""
+        groups: dict[tuple[str, ...], list[int]] = {}
+        for j, p in enumerate(self.space):
+            if p.log is not None and not p.targets[0].startswith("sensor:"):
+                groups.setdefault(p.targets, []).append(j)
+        noticed, values = [], self.space.values(self.theta)
+        for members in groups.values():
+            mean, p = float(values[members].mean()), self.space[members[0]]
+            if np.ptp(values[members]) > _DIFFERENT * abs(mean):
+                name = p.name.removesuffix(f"[{p.log}]")
+                noticed.append(finding(Code.MEAN_OF_LOGS, parameters=[name], value=mean, unit=_after(p.unit)))
+        return noticed
+
     @property
     def _near(self) -> FloatArray:
         """How near to a bound a theta (N,) sits on it."""
@@ -138,8 +165,7 @@ class Marginals:
         on_ridge = {name for ridge in ridges for name in ridge.parameters}
         noticed, near = [], self._near
         for j, p in enumerate(self.space):
-            unit = "" if p.unit in ("", "1") else f" {p.unit}"
-            about = functools.partial(finding, parameters=[p.name], unit=unit)
+            about = functools.partial(finding, parameters=[p.name], unit=_after(p.unit))
             pieces = dead.get(p.name, [])
             idle = any(low <= 0 and high >= 1 for low, high in pieces)
             if idle:
@@ -157,6 +183,11 @@ class Marginals:
                 code = Code.AT_PHYSICAL_BOUND if self._shows_none(j) else Code.MODE_AT_BOUND
                 noticed.append(about(code, bound=bound))
         return noticed
+
+
+def _after(unit: str) -> str:
+    """A unit behind a number."""
+    return "" if unit in ("", "1") else f" {unit}"
 
 
 def unmeasured_starts(

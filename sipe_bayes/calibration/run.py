@@ -78,6 +78,7 @@ def calibrate(
     doubted = conflict is not None or (misfit is not None and misfit.alarm)
     marginals = Marginals.of(posterior, problem.prior, method.seed, bounded_by_nature(problem.simulator.model, space))
     combinations = ridges(space, marginals.draws, marginals.contraction.tolist())
+    summaries = marginals.summaries(None if missing is None else missing.further)
     predictions = Predictions.of(problem, theta, checks)
     outside = place_in_prior(problem, method, fit, predictions, checks)
     bands = predictions.bands(posterior, missing if doubted else None, method.seed, checks)
@@ -95,6 +96,8 @@ def calibrate(
         *marginals.worth_measuring(),
         *(ridge.finding(Code.RIDGE_TO_RESOLVE) for ridge in combinations),
         *marginals.findings(ranges_that_change_nothing(fit, checks), combinations),
+        *(marginals.cut_at_bounds(summaries) if doubted else ()),
+        *marginals.means_of_logs(),
         *predictions.findings(),
         *of_logs(problem.reports),
         *_left_out(problem, method),
@@ -104,7 +107,7 @@ def calibrate(
         estimator=method.name,
         posterior=posterior,
         prior=problem.prior,
-        parameters=marginals.summaries(None if missing is None else missing.further),
+        parameters=summaries,
         causes=() if missing is None else missing.causes,
         further=None if missing is None else missing.further,
         train=predictions.train,

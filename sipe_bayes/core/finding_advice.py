@@ -142,6 +142,14 @@ ADVICE: dict[Code, str] = {
         "The interval is about the prior's. `sipe suggest --for NAME` says what to send; or fix it at a measured value."
     ),
     Code.MODE_AT_BOUND: _BOUNDS,
+    Code.WIDER_AT_BOUND: (
+        "The interval would reach further, so that it may miss a value behind the bound. Widen the bounds, unless "
+        "nature sets them, and calibrate again."
+    ),
+    Code.MEAN_OF_LOGS: (
+        "No log had the mean. Where the difference is known, as of a weighed load, say it in the log: `added = "
+        '{"body:NAME.mass" = 3.0}`, in held-out logs too; else put the value that you want into the MJCF.'
+    ),
     Code.AT_PHYSICAL_BOUND: (
         "While a finding blocks, nothing follows from it: what the fit lacks may stand in its place. Else there is "
         "nothing to do: the model does without it, and the interval is one-sided."

@@ -125,9 +125,9 @@ class Code(Enum):
         "the search used {used:.3g} of the logs' {all:.3g} s, in blocks spread over them; `sipe calibrate` of its "
         "result uses all"
     )
-
     STRUCTURES_CUT_SHORT = blocking(
-        "the budget of {budget} rollouts was spent before {before}{untried}: give --budget {larger}, and the same folder goes on"
+        "the budget of {budget} rollouts was spent before {before}{untried}: give --budget {larger}, and the same "
+        "folder goes on"
     )
     COLUMNS_UNTRIED = caution(
         "{count} signs and units of columns were not tried, for which a share of the budget of {budget} rollouts was "
@@ -232,6 +232,12 @@ class Code(Enum):
     )
     MODE_AT_BOUND = caution(
         "{parameters} is at its bound {bound:.4g}{unit}: widen it, unless the bound is physical", "at a bound"
+    )
+    WIDER_AT_BOUND = caution(
+        "{parameters}: the interval with what the model lacks is cut at the bound {bound:.4g}{unit}; widen it"
+    )
+    MEAN_OF_LOGS = caution(
+        "{parameters} differs between the logs; held-out ones and identified.xml have the mean, {value:.4g}{unit}"
     )
     AT_PHYSICAL_BOUND = Text(
         Severity.NOTE,

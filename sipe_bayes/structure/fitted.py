@@ -30,6 +30,7 @@ from sipe_bayes.structure.scores import scores
 
 # structures differ by nats, and where friction has kinks the last ones come in ever smaller steps
 _COARSE = WindowTuning(tolerance=0.1, rough_tolerance=1e-3, most_steps=30)
+_EDGE = 1e-3  # of the cube: at a bound
 _FLAT_SD = 1e3  # of the cube: stands for a uniform prior beside a normal one
 
 
@@ -62,6 +63,18 @@ class FittedStructure:
     held_out: float | None
     rollouts: int
     settled: bool
+
+    @property
+    def spanned(self) -> FloatArray:
+        """The covariance (N + P, N + P), which reaches as far as the optimum where that lies beyond a sd.
+
+        Where simulations are rough, the linearisation at the optimum points elsewhere, with an interval that does not
+        hold it. At a bound the normal's mean may lie behind that.
+        """
+        inside = (self.theta > _EDGE) & (self.theta < 1 - _EDGE)
+        gap = np.where(inside, self.theta - self.mean, 0.0)
+        far = np.abs(gap) > np.sqrt(np.diag(self.covariance))
+        return self.covariance + np.outer(gap, gap) if far.any() else self.covariance
 
     @property
     def noise(self) -> Noise:

@@ -177,10 +177,10 @@ class Structures:
         """The mixture of the normals that structures have for the parameters of a space, each from an index on."""
         own = [(one, slice(first, first + len(space))) for _, one, first in parts]
         means = np.stack([one.mean[at] for one, at in own])
-        covariances = np.stack([one.covariance[at, at] for one, at in own])
+        covariances = np.stack([one.spanned[at, at] for one, at in own])
         # a draw is to come from a structure with its probability, however much of its normal the cube cuts off
         return GaussianMixture(np.log([p for p, _, _ in parts]), means, covariances, space).of_masses()
 
     def posterior_of(self, one: FittedStructure) -> GaussianMixture:
         """Of all parameters of one structure, the extensions' behind the user's."""
-        return GaussianMixture(np.zeros(1), one.mean[None], one.covariance[None], self.simulator(one).space)
+        return GaussianMixture(np.zeros(1), one.mean[None], one.spanned[None], self.simulator(one).space)

@@ -107,3 +107,12 @@ def test_a_rival_that_held_out_pieces_speak_against_does_not_count(held: float |
     state = DiscoverState(Phase.SWAP, (*fitted, rival), ("a", "d"), ranked=(("a",), ("d",)))
     after = StructureSearch(fitting, ())._swap(state)
     assert after.is_refused(("a", "b")) is refused
+
+
+@pytest.mark.parametrize(("theta", "wide"), [(0.7, True), (0.42, False), (0.0, False)])
+def test_an_interval_reaches_as_far_as_the_optimum(theta: float, wide: bool) -> None:
+    """Not where the mean lies behind a bound at which the optimum is, nor where it is within a sd."""
+    mean, covariance = np.array([theta - 0.4 if wide or not theta else 0.4]), np.array([[0.05**2]])
+    one = replace(structure("", 0.0), theta=np.array([theta]), mean=mean, covariance=covariance)
+    expected = np.hypot(0.05, 0.4) if wide else 0.05
+    assert np.sqrt(one.spanned[0, 0]) == pytest.approx(expected)
