@@ -95,7 +95,7 @@ def tables() -> list[type[Table]]:
 
 def default_of(field: FieldInfo) -> str:
     """A key's default; none where it must be given, or where its description says what it is."""
-    needed = field.default is PydanticUndefined and "in place of" not in (field.description or "")
+    needed = field.is_required() and "in place of" not in (field.description or "")
     return "must be given" if needed else "" if field.default is PydanticUndefined else code(field.default)
 
 

@@ -6,6 +6,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.optimize
@@ -17,7 +18,7 @@ from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.evaluate import compare_errors
-from sipe_bayes.diagnostics.identifiability import worth_measuring
+from sipe_bayes.diagnostics.identifiability import ridges, worth_measuring
 from sipe_bayes.diagnostics.records import ChannelScore, LogReport, Ridge, improvement
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -124,7 +125,7 @@ class Marginals:
     def cut_at_bounds(self, summaries: Sequence[ParameterSummary]) -> list[Finding]:
         """Wider intervals that end at a bound which nature does not set, where the plain ones do not."""
         noticed = []
-        for p, one in zip(self.space, summaries, strict=True):
+        for p, one in zip(self.space, summaries, strict=False):
             ends = zip((p.low, p.high), one.further or (), (one.q05, one.q95), strict=False)
             room = _CUT * (p.high - p.low)
             cut = [bound for bound, far, near in ends if abs(far - bound) < room < abs(near - bound)]
@@ -155,14 +156,21 @@ class Marginals:
         """Whether a parameter is as small as nature lets it be."""
         return self.space[j].name in self.natural and bool(self.theta[j] < self._near[j])
 
-    def findings(self, dead: dict[str, list[tuple[float, float]]], ridges: Sequence[Ridge]) -> list[Finding]:
+    @cached_property
+    def ridges(self) -> list[Ridge]:
+        """Combinations that are determined where their members are not, which then are worth no more than a note."""
+        return ridges(self.space, self.draws, self.contraction.tolist())
+
+    def findings(
+        self, dead: dict[str, list[tuple[float, float]]], wider: Sequence[ParameterSummary] = ()
+    ) -> list[Finding]:
         """Of each parameter whether it does anything, is determined, and lies at a bound.
 
         Args:
             dead: parameter -> pieces of [0, 1] over which it changes nothing.
-            ridges: whose members are open by themselves, which is then worth no more than a note.
+            wider: summaries whose wider intervals are what is to be used; none where the plain ones are.
         """
-        on_ridge = {name for ridge in ridges for name in ridge.parameters}
+        on_ridge = {name for ridge in self.ridges for name in ridge.parameters}
         noticed, near = [], self._near
         for j, p in enumerate(self.space):
             about = functools.partial(finding, parameters=[p.name], unit=_after(p.unit))
@@ -182,7 +190,7 @@ class Marginals:
                 bound = p.low if value - p.low < p.high - value else p.high
                 code = Code.AT_PHYSICAL_BOUND if self._shows_none(j) else Code.MODE_AT_BOUND
                 noticed.append(about(code, bound=bound))
-        return noticed
+        return [*noticed, *self.cut_at_bounds(wider), *self.means_of_logs()]
 
 
 def _after(unit: str) -> str:

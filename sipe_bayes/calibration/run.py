@@ -32,7 +32,6 @@ from sipe_bayes.core.files import installed_version
 from sipe_bayes.core.findings import Code, Finding, Findings, finding
 from sipe_bayes.diagnostics.agreement import disagreement
 from sipe_bayes.diagnostics.bands import band_coverage
-from sipe_bayes.diagnostics.identifiability import ridges
 from sipe_bayes.diagnostics.records import Mixing
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.envs.unknowns import bounded_by_nature
@@ -77,7 +76,6 @@ def calibrate(
     misfit, missing = lacks.misfit, lacks.physics(space)
     doubted = conflict is not None or (misfit is not None and misfit.alarm)
     marginals = Marginals.of(posterior, problem.prior, method.seed, bounded_by_nature(problem.simulator.model, space))
-    combinations = ridges(space, marginals.draws, marginals.contraction.tolist())
     summaries = marginals.summaries(None if missing is None else missing.further)
     predictions = Predictions.of(problem, theta, checks)
     outside = place_in_prior(problem, method, fit, predictions, checks)
@@ -94,10 +92,8 @@ def calibrate(
         *uneven_targets(problem.environment),
         *([] if conflict is None else [conflict.finding]),
         *marginals.worth_measuring(),
-        *(ridge.finding(Code.RIDGE_TO_RESOLVE) for ridge in combinations),
-        *marginals.findings(ranges_that_change_nothing(fit, checks), combinations),
-        *(marginals.cut_at_bounds(summaries) if doubted else ()),
-        *marginals.means_of_logs(),
+        *(ridge.finding(Code.RIDGE_TO_RESOLVE) for ridge in marginals.ridges),
+        *marginals.findings(ranges_that_change_nothing(fit, checks), summaries if doubted else ()),
         *predictions.findings(),
         *of_logs(problem.reports),
         *_left_out(problem, method),
@@ -115,7 +111,7 @@ def calibrate(
         findings=noticed,
         signals=predictions.signals(bands),
         residuals=list(lacks.residuals),
-        ridges=combinations,
+        ridges=marginals.ridges,
         bands=band_coverage(predictions.windows["holdout"], *bands["holdout"]) if "holdout" in bands else None,
         comparison=predictions.comparison,
         misfit=misfit,

@@ -59,12 +59,12 @@ def test_what_nature_bounds_is_told_apart_from_a_bound_that_was_chosen(tmp_path:
     assert natural == {"friction"}
     posterior = GaussianMixture(np.zeros(1), np.array([[-0.01, -0.01]]), 1e-4 * np.eye(2)[None], space)
     marginals = Marginals.of(posterior, uniform(space), 0, natural)
-    codes = {item.code: item.parameters for item in marginals.findings({}, [])}
+    codes = {item.code: item.parameters for item in marginals.findings({})}
     assert codes == {Code.AT_PHYSICAL_BOUND: ("friction",), Code.MODE_AT_BOUND: ("mass",)}
     friction, mass = marginals.summaries()
     assert friction.q05 == 0.0
     beside = GaussianMixture(np.zeros(1), np.array([[0.5, 1e-5]]), 4e-10 * np.eye(2)[None], space)
-    noticed = Marginals.of(beside, uniform(space), 0, natural).findings({}, [])
+    noticed = Marginals.of(beside, uniform(space), 0, natural).findings({})
     assert [item.code for item in noticed] == [Code.MODE_AT_BOUND]  # pressed there, and sharp
     assert 0.2 < mass.q05 <= mass.mode
 

@@ -207,7 +207,8 @@ def keys_of(table: dict[str, Any], prefix: str = "") -> list[str]:
     for key, value in table.items():
         inner = value if isinstance(value, list) and value and isinstance(value[0], dict) else [value]
         for one in inner:
-            found += keys_of(one, f"{prefix}{key}.") if isinstance(one, dict) else [f"{prefix}{key}"]
+            names = isinstance(one, dict) and key != "added"  # whose keys are targets
+            found += keys_of(one, f"{prefix}{key}.") if names else [f"{prefix}{key}"]
     return found
 
 
