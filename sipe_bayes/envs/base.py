@@ -48,6 +48,7 @@ class Environment(ABC):
     memory_size: int = 0  # M, columns of a stepwise environment's states behind MuJoCo's own
     goal_size: int = 0  # G
     rotations: tuple[tuple[int, int, int], ...] = ()  # channels that are together a rotation vector (rad)
+    added: tuple[object, ...] = ()  # what single logs have more than the model
     poses: tuple[PoseReading, ...] = ()  # what the channels tell of free and ball joints
 
     @property

@@ -66,10 +66,11 @@ class Simulator(Simulated):
         return max(1, min(self.runs.wave, _WAVE_NUMBERS // width))
 
     def checksum(self) -> str:
-        """That of the compiled default model, and of the device where it is not the processor."""
-        model = super().checksum()
-        kind = self.device.partition(":")[0]
-        return model if kind == "cpu" else hashlib.sha256(f"{model} {kind}".encode()).hexdigest()
+        """That of the compiled default model, of what logs have more, and of the device if not the processor."""
+        parts, kind = [super().checksum()], self.device.partition(":")[0]
+        parts += [repr(self.environment.added)] if self.environment.added else []
+        parts += [kind] if kind != "cpu" else []
+        return parts[0] if len(parts) == 1 else hashlib.sha256(" ".join(parts).encode()).hexdigest()
 
     def _repr_html_(self) -> str:
         model = self.model

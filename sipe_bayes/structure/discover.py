@@ -205,7 +205,6 @@ def _fingerprint(search: StructureSearch, simulator: Simulator, restriction: Res
         "prior": [x.tolist() for x in fitting.prior.gaussian_moments()],
         "likelihood": repr(fitting.likelihood),
         "seed": fitting.seed,
-        "added": repr(fitting.environment.added),
         "options": search.options.plain(),
         "restriction": repr(restriction),
         "extensions": list(EXTENSIONS),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -50,6 +51,7 @@ def test_it_is_the_model_with_that_mass() -> None:
     theta = np.full((4, 3), 0.4)
     starts = np.repeat(simulator.default_state()[None], 4, axis=0)
     seen = simulator.rollout(theta, np.stack([force] * 4), starts, 0.01, logs=["a", "b", "c", None]).observations
+    assert simulator.checksum() != Simulator(replace(simulator.environment, added=()), 1).checksum()
     cart = float(PARAMETERS[0].value(0.4))
     for run, (own, load) in zip(seen, [(cart, 1.0), (cart + 1, 4.0), (cart + 0.5, 1.0), (cart, 1.0)], strict=True):
         plain = AXIS.format(load=load, damping=1.0, cart=2.0, gain=1.0)

@@ -6,7 +6,6 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.envs.base import Environment
-from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.simulation.engine import Engine
 
 _CONTROLS = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
@@ -29,7 +28,7 @@ def check_supported(environment: Environment, engine: Engine) -> None:
         raise Unsupported(
             f"the control of {_name(environment)} has a memory and is computed on the processor between control steps"
         )
-    if isinstance(environment, MjcfEnvironment) and environment.added:
+    if environment.added:
         raise Unsupported("masses that are added in single logs are written on the processor")
     if engine.firmware:
         raise Unsupported("controllers sampled by firmware are stepped on the processor")
