@@ -49,6 +49,7 @@ EXTENSIONS: dict[str, str] = {  # name: module and class
     "gain": "actuator.gain:Gain",
     "log_gain": "actuator.log_gain:LogGain",
     "mass": "body.mass:Mass",
+    "log_mass": "body.log_mass:LogMass",
     "centre_of_mass": "body.centre_of_mass:CentreOfMass",
     "sensor_offset": "world.sensor_offset:SensorOffset",
     "sensor_scale": "world.sensor_scale:SensorScale",

@@ -13,12 +13,12 @@ import pytest
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.internal.elastic import Base, Elastic, Gear, Link
-from sipe_bayes.envs.mjcf import Edit
+from sipe_bayes.envs.mjcf import Edit, MjcfEnvironment
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure import Restriction, discover
 from sipe_bayes.structure.extensions.actuator.lag import FilteredCommand
 from tests.problems.machines import MACHINES, environment
-from tests.problems.pendulums import log, pendulum
+from tests.problems.pendulums import XML, log, pendulum
 
 
 @dataclass(frozen=True)
@@ -142,3 +142,20 @@ def test_what_is_planted_is_found_and_its_size_is_right(plant: Plant) -> None:
     print(values.mean(0), values.std(0), truth)
     error = np.abs(values.mean(0) - np.array(truth))
     assert (error < np.maximum(4 * values.std(0), 0.2 * np.array(truth))).all()
+
+
+def test_a_load_that_one_log_has_is_named() -> None:
+    """Not a gain that differs, nor a mass that is wrong in all of them."""
+    loaded = {"empty": 0.6, "loaded": 0.9, "empty again": 0.6}
+    logs = [
+        log(pendulum(), [mass, 0.08], seed, steps=200, name=name) for seed, (name, mass) in enumerate(loaded.items())
+    ]
+    only = Restriction(only=("log_mass", "log_gain", "mass", "dry_friction"))
+    damping = Parameter("damping", 0.0, 0.2, targets=("joint:hinge.damping",))
+    unloaded = MjcfEnvironment.build(XML, [damping], ["motor"], ["joint:hinge.position"])
+    structures = discover(Simulator(unloaded, 1), Trajectories.stack(logs), restriction=only)
+    print(structures.table())
+    assert structures.best.labels == ("log_mass:rod",)
+    values = np.asarray(structures.posterior_of(structures.best).values(1000))[:, 1:]
+    print(values.mean(0), values.std(0))
+    assert (np.abs(values.mean(0) - [*loaded.values()]) < 4 * values.std(0)).all()
