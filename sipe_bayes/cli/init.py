@@ -30,7 +30,7 @@ def init(
                 progress(f"holding {check} against simulations of its logs", 0, 1)
                 result = checked(check)
             agreed = "units, signs, delays and columns agree with simulations"
-            untold = f"in what simulations tell, which leaves {len(result.doubts)} things open"
+            untold = f"in what simulations tell, which leaves {len(result.doubts)} open"
             nothing = f"{check}: nothing is odd{f' {untold}' if result.doubts else f': {agreed}'}"
             for line in [*(result.odd or [nothing]), *(f"OPEN: {doubt}" for doubt in result.doubts)]:
                 print(line)

@@ -152,6 +152,16 @@ def test_the_most_economical_parameter_is_named() -> None:
     assert "per_log = true" in found.text
 
 
+@pytest.mark.parametrize(("second", "marked"), [(1.2, True), (1.01, False), (0.8, False)])
+def test_a_log_that_asks_for_a_value_beyond_the_bounds_is_marked(second: float, marked: bool) -> None:
+    space = ParameterSpace([Parameter("a", 0.0, 2.0, unit="kg"), Parameter("b")])
+    estimates = [LogEstimate(name, np.array([a, 0.5]), 4000 * np.eye(2)) for name, a in (("x", 0.4), ("y", second))]
+    found = disagreement(space, estimates)
+    assert found is not None
+    assert ("(beyond its bounds)" in found.finding.text) == marked
+    assert "x says 0.8 ± 0.032," in found.finding.text
+
+
 def test_two_differences_are_not_put_down_to_one_parameter() -> None:
     space = ParameterSpace([Parameter("a", unit="kg"), Parameter("b")])
     first = LogEstimate("one", np.array([0.40, 0.50]), 4000 * np.eye(2))
