@@ -229,7 +229,7 @@ class LogEntry(Table):
     """`[start, stop]` in seconds from the first sample; default all"""
     window: Window = None
     """overrides `window` for this log; with `"state_space"`, over what a held-out log is scored (default 0.5 s)"""
-    added: dict[Text, Number] = Field(default_factory=dict)
+    added: dict[Text, Positive] = Field(default_factory=dict)
     """kg that this log, to train on or held out, has more than the model: `{"body:load.mass" = 3.0}` of a known load"""
 
     @model_validator(mode="before")

@@ -100,6 +100,7 @@ def summarise(
         signals=tuple(_signals(before, after, logs, seed)),
         named_share=structures.named_share,
         settled=structures.settled,
+        best_settled=structures.best.settled,
         rollouts=structures.rollouts,
         column_rollouts=structures.state.column_rollouts,
         seconds=time.monotonic() - began,
@@ -122,7 +123,7 @@ def _untried(structures: Structures) -> str:
     """Pieces that a search whose budget was spent did not try, or not to the end, in words."""
     state, search = structures.state, structures.search
     if state.cut is Phase.FIT:
-        names = [search.placed[label].sentence for label in state.queue if label not in structures.best.labels]
+        names = [search.placed[label].sentence for label in state.queue]
     elif state.cut in (Phase.COLUMNS, Phase.RANK):
         names = [one.sentence for one in search.placed.values() if one.label not in state.present]
     else:

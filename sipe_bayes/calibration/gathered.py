@@ -32,7 +32,7 @@ from sipe_bayes.simulation.simulator import Simulator
 _FREE = 0  # mjJNT_FREE
 _DRAWS = 4000  # of the posterior: quantiles to one or two percent of an sd
 _CUT = 2e-3  # of the range, within which an interval ends at a bound
-_DIFFERENT = 0.1  # of the mean of the logs
+_DIFFERENT, _APART = 0.1, 3.0  # of the mean of the logs, and sds of a difference
 _NAMED = 3  # logs of what is summed up
 
 
@@ -126,9 +126,12 @@ class Marginals:
         """Wider intervals that end at a bound which nature does not set, where the plain ones do not."""
         noticed = []
         for p, one in zip(self.space, summaries, strict=False):
-            ends = zip((p.low, p.high), one.further or (), (one.q05, one.q95), strict=False)
-            room = _CUT * (p.high - p.low)
-            cut = [bound for bound, far, near in ends if abs(far - bound) < room < abs(near - bound)]
+            ends = zip((0.0, 1.0), one.further or (), (one.q05, one.q95), strict=False)
+            cut = [
+                (p.low, p.high)[int(end)]
+                for end, far, near in ends
+                if abs(float(p.normalise(far)) - end) < _CUT < abs(float(p.normalise(near)) - end)
+            ]
             for bound in [bound for bound in cut if not (bound == p.low and p.name in self.natural)]:
                 noticed.append(finding(Code.WIDER_AT_BOUND, parameters=[p.name], bound=bound, unit=_after(p.unit)))
         return noticed
@@ -142,7 +145,8 @@ class Marginals:
         noticed, values = [], self.space.values(self.theta)
         for members in groups.values():
             mean, p = float(values[members].mean()), self.space[members[0]]
-            if np.ptp(values[members]) > _DIFFERENT * abs(mean):
+            apart = float(np.ptp(self.theta[members])) > _APART * float(np.hypot(*np.sort(self.sd[members])[-2:]))
+            if len(members) > 1 and apart and np.ptp(values[members]) > _DIFFERENT * abs(mean):
                 name = p.name.removesuffix(f"[{p.log}]")
                 noticed.append(finding(Code.MEAN_OF_LOGS, parameters=[name], value=mean, unit=_after(p.unit)))
         return noticed

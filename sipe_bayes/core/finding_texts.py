@@ -131,8 +131,7 @@ class Code(Enum):
     )
     COLUMNS_UNTRIED = caution(
         "{count} signs and units of columns were not tried, for which a share of the budget of {budget} rollouts was "
-        "not enough, the most promising that {example}: see that the columns are right, or give --budget {larger} and "
-        "another --out"
+        "not enough, the most promising that {example}: see that the columns are right, or give --budget {larger}"
     )
 
     # laplace

@@ -131,13 +131,14 @@ class Discovery:
         after: what the most probable structure leaves.
         signals: of each log and channel; ``mode`` is the structure, ``default`` the plain model, calibrated.
         named_share: of what can be explained, what named pieces explain; None where that was not asked.
-        settled: whether every fit that counts came to rest.
+        settled: whether every fit that counts came to rest, and the budget was enough.
         rollouts: of all fits.
         column_rollouts: those of them that tried signs and units of columns.
         seconds: that it took.
         findings: what was noticed on the way.
         run: record of the run.
         out: folder of the results.
+        best_settled: whether the fit of the most probable structure came to rest.
     """
 
     name: str
@@ -165,6 +166,7 @@ class Discovery:
     findings: tuple[Finding, ...] = ()
     run: Mapping[str, object] = field(default_factory=dict)
     out: str = ""
+    best_settled: bool = True
 
     @property
     def kept(self) -> tuple[Piece, ...]:
@@ -194,6 +196,7 @@ class Discovery:
             **{name: _stage(stage) for name, stage in (("before", self.before), ("after", self.after))},
             "named_share": self.named_share,
             "settled": self.settled,
+            "best_settled": self.best_settled,
             "findings": [item.to_dict() for item in self.findings],
             "warnings": Findings(self.findings).warnings,
             "rollouts": self.rollouts,

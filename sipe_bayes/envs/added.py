@@ -8,7 +8,6 @@ from functools import cached_property
 
 import mujoco
 
-from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.envs.target import Target, TargetError
 from sipe_bayes.envs.targets import bind, split
 
@@ -19,7 +18,7 @@ class Added:
 
     Args:
         log: its name.
-        target: ``body:NAME.mass``; the body's inertia grows in proportion.
+        target: ``body:NAME.mass``; the body's inertia grows in proportion, where no parameter writes it.
         value: in kg.
     """
 
@@ -30,11 +29,11 @@ class Added:
 
 @dataclass(frozen=True)
 class AddedValues:
-    """All of them, bound to a model."""
+    """All of them, bound to a model, among the writes of its parameters: (parameter, multiplier, target)."""
 
     model: mujoco.MjModel
     added: tuple[Added, ...]
-    parameters: ParameterSpace
+    targets: tuple[tuple[int, float, Target], ...]
 
     @cached_property
     def _of_log(self) -> dict[str, dict[str, float]]:
@@ -44,10 +43,11 @@ class AddedValues:
         return out
 
     @cached_property
-    def unwritten(self) -> tuple[Target, ...]:
-        """Targets that no parameter writes, bound to the model."""
-        written = {target for parameter in self.parameters for target in parameter.targets}
-        return tuple(bind(self.model, t) for t in dict.fromkeys(one.target for one in self.added) if t not in written)
+    def writes(self) -> list[tuple[int | None, float, Target]]:
+        """All writes in the order they must be done; no parameter for a target that none writes."""
+        written = {target.spec for _, _, target in self.targets}
+        alone = [spec for spec in dict.fromkeys(one.target for one in self.added) if spec not in written]
+        return sorted([*self.targets, *((None, 1.0, bind(self.model, s)) for s in alone)], key=lambda w: w[2].order)
 
     def to(self, target: Target, log: str | None) -> float:
         """What is added to a target in a log."""

@@ -217,7 +217,7 @@ class MjcfEnvironment(Environment):
 
     @cached_property
     def _more(self) -> AddedValues:
-        return AddedValues(self._model, self.added, self.parameters)
+        return AddedValues(self._model, self.added, tuple(self._targets))
 
     @property
     def by_log(self) -> bool:
@@ -230,13 +230,12 @@ class MjcfEnvironment(Environment):
         physical = True
         if bodies:
             restore_inertia(model, self._model, bodies)
-        for j, multiplier, target in self._targets:
-            if j in table:
-                value = multiplier * mean_over(values, table[j]) + self._more.to(target, log)
+        for j, multiplier, target in self._more.writes:
+            if j is None or j in table:
+                value = target.value if j is None else multiplier * mean_over(values, table[j])
+                value += self._more.to(target, log)
                 physical &= value >= target.minimum
                 target.write(model, value)
-        for target in self._more.unwritten:
-            target.write(model, target.value + self._more.to(target, log))
         return physical and (not bodies or check_inertia(model, bodies))
 
     def start_sd(self, model: mujoco.MjModel) -> FloatArray:

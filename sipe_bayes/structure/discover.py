@@ -106,9 +106,10 @@ def discover(
     given = simulator, trajectories, holdout, prior, likelihood, restriction, options, budget, seed, progress
     search = _search(*given)
     fingerprint = _fingerprint(search, simulator, restriction or Restriction())
-    state = DiscoverState()
+    state = DiscoverState(budget=search.budget)
     if checkpoint is not None and checkpoint.exists():
-        state = load_state(checkpoint, DiscoverState, fingerprint)
+        enough = search.options.fit_budget / search.options.plain_share
+        state = load_state(checkpoint, DiscoverState, fingerprint).with_budget(search.budget, enough)
     saved = -_SAVE_SECONDS
     while not state.done:
         before, state = state, search.step(state)

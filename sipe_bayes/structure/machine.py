@@ -145,6 +145,10 @@ class Machine:
         """Targets that the user's parameters write."""
         return frozenset(t for p in self.environment.parameters for t in p.targets)
 
+    def has_added(self, body: str) -> bool:
+        """Whether the user says of a log by how much a body is heavier in it."""
+        return any(one.target == f"body:{body}.mass" for one in self.environment.added)
+
 
 def machine_of(windows: Windows, theta: FloatArray, starts: FloatArray) -> Machine:
     """The machine as it moves at an estimate.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.structure.columns import Column
@@ -81,6 +81,7 @@ class DiscoverState:
         judged: what held-out logs say of structures.
         refused: labels of structures that they speak against.
         cut: what the search was doing when the budget was spent; None while it is not.
+        budget: rollouts at most, of which the plain fit and the trials of columns get a share.
     """
 
     phase: Phase = Phase.PLAIN
@@ -99,6 +100,18 @@ class DiscoverState:
     judged: tuple[Judgement, ...] = ()
     refused: tuple[tuple[str, ...], ...] = ()
     cut: Phase | None = None
+    budget: int = 0
+
+    def with_budget(self, budget: int, plain_fit: float) -> DiscoverState:
+        """It with another budget; from the beginning where a larger one would have fitted or tried more at first.
+
+        Args:
+            budget: rollouts at most, of all.
+            plain_fit: budget from which the plain fit has all that a fit may have.
+        """
+        short = self.budget < plain_fit and not (self.fitted and self.fitted[0].settled)
+        anew = budget > self.budget and (short or bool(self.untried))
+        return DiscoverState(budget=budget) if anew else replace(self, budget=budget)
 
     @property
     def done(self) -> bool:

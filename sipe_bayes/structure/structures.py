@@ -87,9 +87,10 @@ class Structures:
     def _counts(self, one: FittedStructure) -> bool:
         """Whether a structure of named pieces foretells held-out pieces better than every smaller one tried.
 
-        And whether no held-out log speaks against it.
+        And whether no held-out log speaks against it, and the budget did not end in its fit.
         """
-        if self._is_yardstick(one) or self.state.is_refused(one.labels):
+        cut_off = self.state.cut is not None and one is self.fitted[-1] is not self.plain and not one.settled
+        if self._is_yardstick(one) or self.state.is_refused(one.labels) or cut_off:
             return False
         smaller = [o for o in self.fitted if set(o.labels) < set(one.labels)]
         return all(one.held_out is None or o.held_out is None or one.held_out > o.held_out for o in smaller)

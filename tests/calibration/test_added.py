@@ -61,6 +61,18 @@ def test_it_is_the_model_with_that_mass() -> None:
         np.testing.assert_allclose(run, expected, rtol=0, atol=1e-9)
 
 
+def test_an_inertia_that_is_unknown_stays_so_beside_it_and_no_mass_is_negative() -> None:
+    text = AXIS.format(load=1.0, damping=1.0, cart=2.0, gain=1.0)
+    unknown = [Parameter("inertia", 0.001, 0.1, targets=("body:load.inertia_yy",))]
+    for value, physical in ((0.5, True), (-3.0, False)):
+        added = [Added("b", "body:load.mass", value)]
+        environment = MjcfEnvironment.build(text, unknown, ["drive"], ["joint:rail.position"], added=added)
+        model = environment.compile()
+        for log in ("a", "b"):
+            assert environment.write(model, np.array([0.002]), log) == (physical or log == "a")
+            assert np.isclose(model.body("load").inertia, 0.002).any() or not physical
+
+
 @pytest.mark.parametrize(("target", "words"), [("joint:rail.damping", "only masses"), ("body:cast.mass", "'cast'")])
 def test_what_is_no_mass_is_refused(target: str, words: str) -> None:
     text = AXIS.format(load=1.0, damping=1.0, cart=2.0, gain=1.0)

@@ -15,9 +15,10 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood.settings import BudgetTooSmall, Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.structure import DiscoverOptions, Extension, Restriction, Structures, discover
-from sipe_bayes.structure.columns import choices, moving, unexplained
+from sipe_bayes.structure.columns import Column, choices, moving, unexplained
+from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.machine import Machine
-from sipe_bayes.structure.state import Phase
+from sipe_bayes.structure.state import DiscoverState, Phase
 from tests.problems.machines import MACHINES, environment
 from tests.problems.pendulums import log, pendulum
 
@@ -257,3 +258,18 @@ def test_a_long_log_is_searched_on_blocks_of_it() -> None:
     windows = structures.search.fitting.windows(structures.simulator(structures.plain))
     assert (windows.steps * windows.dt).sum() == pytest.approx(half, rel=0.15)
     assert structures.best.labels == ("dry_friction:hinge",)
+
+
+def test_a_larger_budget_begins_anew_where_the_smaller_one_told_the_beginning_short() -> None:
+    """A plain fit that had not come to rest in its share, or columns that were not tried; else it goes on."""
+    plain = FittedStructure(
+        (), np.zeros(1), np.zeros(1), np.eye(1), np.zeros(0), np.zeros(0), np.zeros(0), 0.0, None, 7, settled=True
+    )
+    state = DiscoverState(phase=Phase.FIT, fitted=(plain,), queue=("a",), budget=100)
+    assert state.with_budget(200, 150) == replace(state, budget=200)
+    unsettled = replace(state, fitted=(replace(plain, settled=False),))
+    assert unsettled.with_budget(200, 150) == DiscoverState(budget=200)
+    assert unsettled.with_budget(200, 80).fitted == unsettled.fitted  # it had all that a fit may have
+    assert unsettled.with_budget(100, 150).fitted == unsettled.fitted  # an interruption, not a larger budget
+    untried = replace(state, untried=(Column("angle", False, -1.0),))
+    assert untried.with_budget(200, 150) == DiscoverState(budget=200)

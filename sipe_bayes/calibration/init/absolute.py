@@ -162,7 +162,8 @@ def _first_better(
             continue
         zero, then = min(after, key=lambda one: float(one[1].missed.mean()))
         if not zero.why:
-            zero, then = _refined(case, zero, then)
+            few = case if searched is _searched else replace(case, trial=case.trial.thinned(_FEWER))
+            zero, then = _refined(case, few, zero, then)
         better = now.missed - then.missed
         error = float(better.std()) / np.sqrt(len(better))
         if better.mean() > max(_BETTER if zero.why else _FAR_BETTER, _CLEAR * error):
@@ -170,16 +171,16 @@ def _first_better(
     return None
 
 
-def _refined(case: Case, zero: _Zero, now: _Fitted) -> tuple[_Zero, _Fitted]:
+def _refined(case: Case, few: Case, zero: _Zero, now: _Fitted) -> tuple[_Zero, _Fitted]:
     """A zero of a grid looked for once more around itself, and the unknowns fitted anew, as long as that is better.
 
-    The grid was simulated with unknowns that had been fitted without it.
+    The grid was simulated with unknowns that had been fitted without it. few: the windows for grids.
     """
     for _ in range(_ROUNDS):
         around = zero.value + zero.unsure * np.linspace(-1, 1, 2 * _FINER - 1)
         zeros = [replace(zero, value=float(value)) for value in around]
         sets: list[Readings] = [one.put(now.readings) for one in zeros]
-        best = int(np.argmin(_missed([replace(case, theta=now.theta)], sets)))
+        best = int(np.argmin(_missed([replace(few, theta=now.theta)], sets)))
         then = _fitted(case, sets[best])
         if not then.missed.mean() < now.missed.mean():
             break
@@ -252,7 +253,7 @@ def _searched(cases: Sequence[Case], model: mujoco.MjModel, k: int, joint: Joint
 def _searched_soon(
     cases: Sequence[Case], model: mujoco.MjModel, k: int, joint: Joint, near: Sequence[Readings]
 ) -> Tried:
-    """The same of few windows, and of the best units and signs alone."""
+    """The same of few windows, and of the best units alone."""
     few = [replace(case, trial=case.trial.thinned(_FEWER)) for case in cases]
     tried = _searched(few, model, k, joint, near[:1])
     misses = _missed(cases, [readings for _, _, readings in tried]).tolist()

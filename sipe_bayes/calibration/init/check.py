@@ -65,7 +65,7 @@ def checked(path: Path) -> Checked:
         ModelError: for a model that does not compile.
     """
     config = load_config(path)
-    environment_of(config, config.logs_for("train"))  # raises what a calibration would
+    environment_of(config, config.logs_for("train"), config.logs_for("holdout"))  # raises what a calibration would
     folder = path.parent
     model = compile_spec(load_spec(str(config.model)), str(config.model))
     machine = Machine.of(model)

@@ -150,5 +150,5 @@ def _goals(simulator: Simulator | CallableSimulator, trajectories: Trajectories)
 
 
 def _names(simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> tuple[str, ...]:
-    by_log = isinstance(simulator, Simulator) and simulator.environment.by_log
-    return tuple(trajectories.names) if by_log else ()
+    loaded = isinstance(simulator, Simulator) and bool(simulator.environment.added)
+    return tuple(trajectories.names) if loaded or any(p.log is not None for p in simulator.space) else ()

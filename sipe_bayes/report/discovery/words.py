@@ -151,7 +151,8 @@ def remains(discovery: Discovery) -> Verdict | None:
 def trust(discovery: Discovery) -> Verdict:
     """Which intervals hold: those averaged over the structures, once residuals pass and the search has settled."""
     cut = cut_short(discovery)
-    if cut is not None and discovery.kept and any(p.further is not None for p in discovery.parameters):
+    usable = discovery.kept and discovery.best_settled and any(p.further is not None for p in discovery.parameters)
+    if cut is not None and usable:
         return Verdict("fair", f"Use values within the intervals with what the model lacks, no narrower: {cut}.")
     if cut is not None:
         return Verdict("bad", f"No value may be trusted yet: {cut}.")

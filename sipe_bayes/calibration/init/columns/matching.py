@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -54,7 +54,8 @@ def match_columns(machine: Machine, table: Table) -> Matches:
     commands, rivals = _commands(machine, _called_as_actuators(machine, over, _WANTED), offsets)
     forces = _forces(machine, labels, offsets, commands)
     used = {c for m in (*positions, *velocities, *commands, *vectors, *forces) for c in m.columns}
-    positions += _left_over(machine, positions, [x for x in labels if x.column not in used], unnamed)
+    spare = [label for label in labels if label.column in unnamed - used]
+    positions += _left_over(machine, positions, spare, table)
     used |= {match.column for match in positions}
     left = tuple(name for name in table if name not in used)
     doubts = (*open_vectors, *open_commands)
@@ -63,16 +64,17 @@ def match_columns(machine: Machine, table: Table) -> Matches:
     )
 
 
-def _left_over(
-    machine: Machine, positions: Sequence[Match], labels: Sequence[Label], unnamed: Collection[str]
-) -> list[Match]:
-    """The one column whose name says nothing, for the one joint that no column measures: pendel_winkel for a pivot."""
+def _left_over(machine: Machine, positions: Sequence[Match], unnamed: Sequence[Label], table: Table) -> list[Match]:
+    """The one column whose name says nothing, for the one joint that no column measures: pendel_winkel for a pivot.
+
+    One that only rises counts something.
+    """
     measured = {match.target for match in positions}
     bare = [joint for joint in machine.joints if f"joint:{joint.name}.position" not in measured]
-    labels = [label for label in labels if label.column in unnamed]
-    if not positions or not len(bare) == len(labels) == 1:
+    moving = [label for label in unnamed if _falls(table[label.column])]
+    if not positions or not len(bare) == len(moving) == 1:
         return []
-    return [Match((labels[0].column,), f"joint:{bare[0].name}.position", replace(labels[0], kind=Kind.POSITION), 0.0)]
+    return [Match((moving[0].column,), f"joint:{bare[0].name}.position", replace(moving[0], kind=Kind.POSITION), 0.0)]
 
 
 def _falls(values: FloatArray) -> bool:

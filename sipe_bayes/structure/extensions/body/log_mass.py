@@ -7,6 +7,7 @@ from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.machine import Machine
 
 _SD, _LEAST, _MOST = 0.5, 0.25, 4.0  # of the model's mass, as of ``Mass``
+_LOGS = 12  # at most: it has a number for each
 
 
 class LogMass(Extension):
@@ -20,10 +21,13 @@ class LogMass(Extension):
         return f"a mass of {site} that differs between the logs"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
-        """A mass for each log, with a normal prior around the model's; none where it is an unknown already."""
+        """A mass for each log, with a normal prior around the model's.
+
+        None where it is an unknown already, where a log says what it has more, or of more than a dozen logs.
+        """
         head, own = f"body:{site}.", machine.bodies[site].mass
         known = any(target.startswith((f"{head}mass", f"{head}inertia")) for target in machine.written())
-        if len(machine.logs) < 2 or known:
+        if not 2 <= len(machine.logs) <= _LOGS or known or machine.has_added(site):
             return ()
         return tuple(
             Parameter(

@@ -28,9 +28,10 @@ class Mass(Extension):
         return f"a mass of {site} that is {100 * share:.3g} % off"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
-        """The mass, with a normal prior around the model's; none of a body whose mass or inertia is unknown already."""
+        """The mass, with a normal prior around the model's; none of a body whose mass is known or unknown already."""
         head, own = f"body:{site}.", machine.bodies[site].mass
-        if any(target.startswith((f"{head}mass", f"{head}inertia")) for target in machine.written()):
+        known = any(target.startswith((f"{head}mass", f"{head}inertia")) for target in machine.written())
+        if known or machine.has_added(site):
             return ()
         return (
             Parameter(

@@ -216,9 +216,13 @@ def test_only_what_nothing_names_is_taken_by_order() -> None:
         (["u", "beam_deg", "kugel_weg", "rinne"], ["beam_deg"]),  # either may
         (["u", "beam_deg", "room_temp"], ["beam_deg"]),
         (["u", "kugel_weg"], []),  # nothing tells that any joint is measured
+        (["u", "beam_deg", "counter"], ["beam_deg"]),  # it only rises
+        (["u", "beam_deg", "kugel_weg", "counter"], ["beam_deg", "kugel_weg"]),
     ],
 )
 def test_the_one_column_left_measures_the_one_joint_left(columns: list[str], measured: list[str]) -> None:
-    matches = matched(Machine.of(mujoco.MjModel.from_xml_string(BEAM.format(kind="motor"))), columns)
+    walks = np.cumsum(np.random.default_rng(0).standard_normal((len(columns), 60)), axis=1)
+    table = {name: np.arange(60.0) if name == "counter" else walk for name, walk in zip(columns, walks, strict=True)}
+    matches = match_columns(Machine.of(mujoco.MjModel.from_xml_string(BEAM.format(kind="motor"))), table)
     assert [m.column for m in matches.positions] == measured
     assert all(not m.sure for m in matches.positions if m.column == "kugel_weg")
