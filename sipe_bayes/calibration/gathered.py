@@ -143,10 +143,10 @@ class Marginals:
             if p.log is not None and not p.targets[0].startswith("sensor:"):
                 groups.setdefault(p.targets, []).append(j)
         noticed, values = [], self.space.values(self.theta)
-        for members in groups.values():
+        for members in (group for group in groups.values() if len(group) > 1):
             mean, p = float(values[members].mean()), self.space[members[0]]
             apart = float(np.ptp(self.theta[members])) > _APART * float(np.hypot(*np.sort(self.sd[members])[-2:]))
-            if len(members) > 1 and apart and np.ptp(values[members]) > _DIFFERENT * abs(mean):
+            if apart and np.ptp(values[members]) > _DIFFERENT * abs(mean):
                 name = p.name.removesuffix(f"[{p.log}]")
                 noticed.append(finding(Code.MEAN_OF_LOGS, parameters=[name], value=mean, unit=_after(p.unit)))
         return noticed

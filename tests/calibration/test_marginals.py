@@ -42,6 +42,7 @@ def test_a_wider_interval_that_is_cut_at_a_bound(
 def test_the_mean_of_logs_that_no_log_had(second: float, told: bool, target: str) -> None:
     logs = [Parameter(f"mass[{log}]", 0.0, 10.0, targets=(target,), log=log, unit="kg") for log in ("empty", "loaded")]
     noticed = marginals(ParameterSpace(logs), [0.3, second]).means_of_logs()
+    assert not marginals(ParameterSpace(logs[:1]), [0.3]).means_of_logs()
     told &= not target.startswith("sensor:")
     assert [one.code for one in noticed] == [Code.MEAN_OF_LOGS] * told
     assert all("mass differs" in one.text and "the mean, 5 kg" in one.text for one in noticed)
