@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.structure.extension import Extension
+from sipe_bayes.structure.extensions.body.mass import Mass
 from sipe_bayes.structure.machine import Machine
 
-_SD, _LEAST, _MOST = 0.5, 0.25, 4.0  # of the model's mass, as of ``Mass``
 _LOGS = 12  # at most: it has a number for each
 
 
@@ -21,24 +23,11 @@ class LogMass(Extension):
         return f"a mass of {site} that differs between the logs"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
-        """A mass for each log, with a normal prior around the model's.
-
-        None where it is an unknown already, where a log says what it has more, or of more than a dozen logs.
-        """
-        head, own = f"body:{site}.", machine.bodies[site].mass
-        known = any(target.startswith((f"{head}mass", f"{head}inertia")) for target in machine.written())
-        if not 2 <= len(machine.logs) <= _LOGS or known or machine.has_added(site):
+        """A mass for each log, bounds and prior as of ``Mass``; none where that has none, or beyond a dozen logs."""
+        if not 2 <= len(machine.logs) <= _LOGS:
             return ()
         return tuple(
-            Parameter(
-                f"{site}.mass[{log}]",
-                _LEAST * own,
-                _MOST * own,
-                prior_mean=own,
-                prior_sd=_SD * own,
-                targets=(f"{head}mass",),
-                log=log,
-                description="mass in this log; the inertia scales with it",
-            )
+            replace(one, name=f"{one.name}[{log}]", log=log, description="mass in this log; the inertia scales with it")
+            for one in Mass().parameters(machine, site)
             for log in machine.logs
         )
