@@ -30,11 +30,11 @@ from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.identifiability import UNIFORM_PRECISION
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.random_effects import LogEstimate
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.quadratic_prior import UNIFORM_PRECISION
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.likelihood.windows import Linearisation, Windows

@@ -33,11 +33,11 @@ from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.identifiability import UNIFORM_PRECISION, ridges
+from sipe_bayes.diagnostics.identifiability import ridges
 from sipe_bayes.diagnostics.records import Ridge
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION
+from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, UNIFORM_PRECISION
 from sipe_bayes.likelihood.restricted import eliminate_starts
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import GaussianMixture, Posterior

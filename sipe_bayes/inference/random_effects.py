@@ -20,7 +20,8 @@ https://doi.org/10.1214/06-BA117A, section 5, on the half-normal's kin.
 
 Deviations:
 
-- Each log's likelihood is its normal at its own optimum.
+- Each log's likelihood is its normal at its own optimum, of the directions of which the log says more than a uniform
+  prior: along a ridge, as of a gain and the masses that it moves, the optimum of a linear model may lie anywhere.
 - A new log's theta is restricted to the cube; those of the logs at hand are not.
 """
 
@@ -34,7 +35,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.options import Options, option
-from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.likelihood.quadratic_prior import UNIFORM_PRECISION, QuadraticPrior
 from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.posterior.snooker import SnookerMove
 from sipe_bayes.posterior.truncated_normal import interval_quantile
@@ -69,6 +70,14 @@ class LogEstimate:
     mean: FloatArray
     information: FloatArray
 
+    @property
+    def determined(self) -> LogEstimate:
+        """With the directions alone of which the log says more than a uniform prior; in the others in the middle."""
+        precision, axes = np.linalg.eigh(self.information)
+        axes = axes[:, precision > UNIFORM_PRECISION]
+        mean = 0.5 + axes @ (axes.T @ (self.mean - 0.5))
+        return LogEstimate(self.name, mean, axes @ (axes.T @ self.information @ axes) @ axes.T)
+
 
 @dataclass(frozen=True)
 class RandomEffects:
@@ -102,6 +111,7 @@ def random_effects(
     if len(logs) < 2:
         raise ValueError(f"logs: expected two or more, got {len(logs)}; one log tells nothing of what differs")
     options = options or RandomEffectsOptions()
+    logs = [log.determined for log in logs]
     model = _Model(
         np.stack([log.information for log in logs]),
         np.stack([log.mean for log in logs]),

@@ -10,6 +10,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.posterior import Posterior
 
 FLAT_PRECISION = 0.01  # sd 10 in units of the cube: closes directions that data or prior leave open, flat within it
+UNIFORM_PRECISION = 12.0  # of a uniform prior in units of the cube: its sd is 1 / sqrt(12)
 
 
 @dataclass(frozen=True)

@@ -101,6 +101,24 @@ def test_what_no_log_knows_keeps_its_prior() -> None:
     assert float(effects.common.stddev[1]) == pytest.approx(1 / np.sqrt(12), rel=0.05)
 
 
+def test_where_a_ridge_ends_in_a_linear_model_does_not_count() -> None:
+    """A gain and a mass whose ratio each log tells, to first order ranges off along it; a known load in one tells both.
+
+    The first three tell 2 mass - gain, the last mass + gain.
+    """
+    along, across = np.array([1.0, 2.0]) / np.sqrt(5), np.array([2.0, -1.0]) / np.sqrt(5)
+    loaded = np.array([1.0, 1.0]) / np.sqrt(2)
+    ridge = 1e6 * np.outer(across, across) + 0.8 * np.outer(along, along)
+    other = 1e6 * np.outer(loaded, loaded)
+    truth = np.array([0.3, 0.6])
+    estimates = [LogEstimate(f"log{k}", truth + far * along, ridge) for k, far in enumerate((15.0, 10.0, 6.0))]
+    estimates.append(LogEstimate("loaded", truth + 20 * np.array([1.0, -1.0]), other))
+    effects = random_effects(estimates, default_prior(space(2)))
+    print(effects.common.mean, effects.common.stddev, effects.spread.mean(0))
+    assert np.abs(effects.common.mean.numpy() - truth).max() < 0.05
+    assert float(effects.common.stddev.max()) < 0.1
+
+
 def test_one_log_is_refused() -> None:
     with pytest.raises(ValueError, match=r"logs: expected two or more, got 1"):
         random_effects(logs([0.5], [0.1]), default_prior(space(1)))
