@@ -179,6 +179,7 @@ def linear_estimates(
     noise: Noise,
     lin: Linearisation,
     parts: Sequence[tuple[str, IntArray]],
+    memory: FloatArray | None = None,
 ) -> list[LogEstimate]:
     """What each part of the logs by itself says to first order, with noise of its own; it simulates nothing.
 
@@ -189,6 +190,7 @@ def linear_estimates(
         noise: (C,) there, from which that of each log is searched.
         lin: the linearisation at both.
         parts: by ``parts_of``.
+        memory: (C,) how many samples tell as much as one of their own; default one.
 
     Returns:
         One for each part.
@@ -201,7 +203,8 @@ def linear_estimates(
         span = float(part.dt.min()), logs.longest
         coloured = bool((noise.tau > 0).any())
         own = estimate_noise(moments, noise, pulls, windows.fixed_sd, coloured, *span, windows.scales)
-        own = Noise(np.maximum(own.sd, windows.rounding), own.tau)
+        sd = np.maximum(own.sd, windows.rounding)
+        own = Noise(sd if memory is None else sd * np.sqrt(memory), own.tau)
         solved = eliminate_starts(moments.normal(own), n, windows.start_precision, pull)
         step = np.linalg.pinv(solved.precision, rcond=1e-12, hermitian=True) @ solved.gradient
         estimates.append(LogEstimate(name, theta + step, solved.precision))

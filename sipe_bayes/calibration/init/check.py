@@ -69,7 +69,7 @@ def checked(path: Path) -> Checked:
     folder = path.parent
     model = compile_spec(load_spec(str(config.model)), str(config.model))
     machine = Machine.of(model)
-    train = config.logs_for("train")[:_LOGS]
+    train = sorted(config.logs_for("train"), key=lambda log: bool(log.added))[:_LOGS]  # with a load, another machine
     opened = open_table(train[0].file, read_table(train[0].file), config.columns.time.rate)
     draft = _draft_of(config, opened, folder)
     part = tried_part(draft)

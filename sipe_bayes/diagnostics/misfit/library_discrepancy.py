@@ -24,8 +24,9 @@ theta flat and integrated out,
     D = \operatorname{diag}(t / \sqrt{c_k S_{kk}}),
 
 b is then (half) normal, and moves theta by its linear answer, and by the trade of a probe that takes from theta what it
-adds (``structure.probes``), whose size is the root of b. The interval widens as the evidence for a discrepancy
-grows, no alarm decides, and it is hardly widened where the residuals show none.
+adds (``structure.probes``), whose size is the root of b. The interval widens as the evidence for a discrepancy grows,
+no alarm decides, and it is hardly widened where the residuals show none. All of it is asked of samples that count for
+what they tell beside those around them (``misfit.probed_logs``), and the posterior is stretched as they are.
 
 Deviations:
 
@@ -86,16 +87,19 @@ class Discrepancy:
 
     Args:
         shift: (M, N) draws of how far theta then is off.
+        stretch: (N,) of the posterior's own sds, where samples tell less than it takes them for.
         causes: extensions that move theta most, in words.
     """
 
     shift: FloatArray
+    stretch: FloatArray
     causes: tuple[str, ...]
 
     def widened(self, posterior: Posterior, seed: int) -> Particles:
-        """Draws of a posterior of theta, moved."""
+        """Draws of a posterior of theta, stretched and moved."""
         drawn = posterior.sample((len(self.shift),), generator=torch.Generator().manual_seed(seed)).numpy()
-        return Particles(np.clip(drawn + self.shift, 0, 1), posterior.space)
+        middle = drawn.mean(0)
+        return Particles(np.clip(middle + self.stretch * (drawn - middle) + self.shift, 0, 1), posterior.space)
 
 
 def library_discrepancy(logs: ProbedLogs, seed: int = 0, options: DiscrepancyOptions = _OPTIONS) -> Discrepancy | None:
@@ -109,7 +113,9 @@ def library_discrepancy(logs: ProbedLogs, seed: int = 0, options: DiscrepancyOpt
     Returns:
         None where no extension does what theta cannot.
     """
+    plain, logs = logs.seen.variance, logs.discounted
     seen, n = logs.seen, logs.windows.num_theta
+    stretch = np.sqrt(np.where(plain > 0, seen.variance / np.where(plain > 0, plain, 1.0), 1.0))
     whole, cross = logs.arrow.precision[n:, n:], logs.arrow.precision[n:, :n]
     information = whole - cross @ seen.answer
     size, full = np.diag(information), np.diag(whole)
@@ -130,7 +136,7 @@ def library_discrepancy(logs: ProbedLogs, seed: int = 0, options: DiscrepancyOpt
 
     square = {name: (moved(name) ** 2).mean(0) / np.maximum(seen.variance, 1e-300) for name in dict.fromkeys(names)}
     most = sorted(square, key=lambda name: -float(square[name].sum()))
-    return Discrepancy(moved(), tuple(most[: options.causes]))
+    return Discrepancy(moved(), stretch, tuple(most[: options.causes]))
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.agreement import linear_estimates, parts_of
 from sipe_bayes.diagnostics.misfit.library_discrepancy import library_discrepancy
-from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs
+from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs, remembering
 from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances, named, untold, widened
 from sipe_bayes.inference.random_effects import LogEstimate, random_effects
 from sipe_bayes.likelihood.noise import Noise
@@ -108,11 +108,13 @@ def missing_physics(
         return None
     numbers = untold(logs, tolerances)
     causes = _Causes.of(logs, options)
-    further = random_effects(_estimates(logs, parts, logs.noise, np.zeros(len(logs.probes))), prior, seed).new_log
+    nothing = np.zeros(len(logs.probes))
+    further = random_effects(_estimates(logs, parts, logs.noise, logs.memory, nothing), prior, seed).new_log
     explained = False
     if len(causes.kept):
         explained = causes.explain(logs, seed)
-        corrected = random_effects(_estimates(logs, parts, causes.noise, causes.sizes(logs)), prior, seed).new_log
+        estimates = _estimates(logs, parts, causes.noise, causes.memory, causes.sizes(logs))
+        corrected = random_effects(estimates, prior, seed).new_log
         corrected = causes.widened(logs, corrected, np.random.default_rng(seed))
         further = corrected if explained else _mixed(further, corrected)
     causes_named = tuple(dict.fromkeys(logs.probes[k].name for k in causes.kept))
@@ -128,13 +130,16 @@ def spread_alone(alone: Sequence[LogEstimate], prior: Posterior, doubted: bool, 
 
 
 def _estimates(
-    logs: ProbedLogs, parts: Sequence[tuple[str, IntArray]], noise: Noise, sizes: FloatArray
+    logs: ProbedLogs, parts: Sequence[tuple[str, IntArray]], noise: Noise, memory: FloatArray, sizes: FloatArray
 ) -> list[LogEstimate]:
-    """What each part of the logs asks for, to first order, where the causes have these sizes (K,)."""
+    """What each part of the logs asks for, to first order, where the causes have these sizes (K,).
+
+    noise: from which that of each part is searched; memory: (C,) of what it leaves.
+    """
     n, count = logs.windows.num_theta, logs.count
     residual = logs.residual - logs.jacobian[..., n:count] @ sizes
     lin = Linearisation(residual, np.concatenate([logs.jacobian[..., :n], logs.jacobian[..., count:]], -1), True)
-    return linear_estimates(logs.windows, logs.theta, logs.starts, noise, lin, parts)
+    return linear_estimates(logs.windows, logs.theta, logs.starts, noise, lin, parts, memory)
 
 
 def _mixed(one: Particles, other: Particles) -> Particles:
@@ -152,6 +157,7 @@ class _Causes:
         covariance: (A, A) of their sizes.
         response: (N, A) of theta to them.
         noise: (C,) with them.
+        memory: (C,) of what they leave.
     """
 
     kept: IntArray
@@ -159,16 +165,17 @@ class _Causes:
     covariance: FloatArray
     response: FloatArray
     noise: Noise
+    memory: FloatArray
 
     @classmethod
     def of(cls, logs: ProbedLogs, options: MissingPhysicsOptions) -> _Causes:
         """In turns with the noise."""
         windows, n = logs.windows, logs.windows.num_theta
-        pull, noise = -windows.start_precision * logs.starts, logs.noise
+        pull, noise, memory = -windows.start_precision * logs.starts, logs.noise, logs.memory
         span = float(windows.dt.min()), windows.trajectories.longest
         usable = np.array([not probe.by_log for probe in logs.probes], bool)
         for _ in range(options.rounds):
-            normal = logs.rows.normal(logs.residual, noise)
+            normal = logs.rows.normal(logs.residual, remembering(noise, memory))
             arrow = eliminate_starts(normal, logs.count, windows.start_precision, pull)
             precision, gradient = arrow.precision + FLAT_PRECISION * np.eye(logs.count), arrow.gradient
             alpha = sparse(precision, gradient, n, usable, logs.one_sided, options)
@@ -187,8 +194,12 @@ class _Causes:
                 logs.moments(columns), noise, pulls, windows.fixed_sd, logs.coloured, *span, windows.scales
             )
             noise = Noise(np.maximum(noise.sd, windows.rounding), noise.tau)
+            step = covariance @ gradient[columns]
+            whole = np.zeros(logs.count)
+            whole[columns] = step
+            memory = logs.memory_of(logs.left(logs.residual, whole, arrow.blocks(whole)), noise)
         response = -np.linalg.solve(precision[:n, :n], precision[:n, n + kept])
-        return cls(kept, covariance @ gradient[columns], covariance[n:, n:], np.asarray(response), noise)
+        return cls(kept, step, covariance[n:, n:], np.asarray(response), noise, memory)
 
     def sizes(self, logs: ProbedLogs) -> FloatArray:
         """Of all K columns, zero of those not kept."""
