@@ -317,6 +317,7 @@ def _as_slope(reading: Reading, place: Reading, slope: Slope, clock: Clock) -> R
         )
         return replace(reading, doubts=(*reading.doubts, doubt))
     wanted = slope.factor * place.sign * find_unit(place.unit).factor * place.factor / find_unit(clock.unit).factor
+    wanted /= reading.factor
     words = unit_words(find_unit(reading.unit).dimension)
     word = min(words, key=lambda w: abs(np.log(abs(wanted) / find_unit(w).factor)))
     sign = 1 if wanted > 0 else -1

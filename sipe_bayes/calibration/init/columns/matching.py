@@ -11,6 +11,7 @@ import scipy.optimize
 
 from sipe_bayes.calibration.init.columns.match import SURE, Match, Matches
 from sipe_bayes.calibration.init.columns.names import (
+    LETTERS,
     OF_BODIES,
     Kind,
     Label,
@@ -84,11 +85,11 @@ def _falls(values: FloatArray) -> bool:
 
 
 def _own_words(machine: Machine) -> set[str]:
-    """Words of velocities and accelerations that are none here: a joint is called so, or nothing has an inertial unit.
+    """Words of quantities that are none here: a joint is called so, or nothing has an inertial unit.
 
     Of these ``gx`` and ``ax`` are short enough to be anything.
     """
-    own = {piece for joint in machine.joints for piece in pieces_of(joint.name)} & OF_BODIES
+    own = {piece for joint in machine.joints for piece in pieces_of(joint.name)} & (OF_BODIES | LETTERS)
     sensors = {kind for _, kind in machine.sensors}
     for kind, letter in (("gyro", "g"), ("accelerometer", "a")):
         if not machine.bodies and kind not in sensors:

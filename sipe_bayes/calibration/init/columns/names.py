@@ -65,27 +65,30 @@ _GREEK = str.maketrans(
     {"θ": "theta", "τ": "tau", "ω": "omega", "φ": "phi", "ϕ": "phi", "α": "alpha", "β": "beta", "ψ": "psi", "°": "deg"}
 )
 _ANGLES = {"angle", "angles", "theta", "phi", "alpha", "beta", "gamma", "psi", "th", "ang", "rotation", "heading"}
+_ANGLES |= {"winkel"}
 _LENGTHS = {"x", "y", "z", "displacement", "disp", "distance", "stroke", "travel", "extension", "height"}
 _PLACES = {"position", "positions", "pos", "q", "qpos", "enc", "encoder", "joint_pos", "actual", "present", "s", "p"}
+_PLACES |= {"lage", "stellung"}
 _POSITIONS = _ANGLES | _LENGTHS | _PLACES
 _ALONG, _ABOUT = {"vx", "vy", "vz"}, {"wx", "wy", "wz", "gx", "gy", "gz"}  # velocities of a body
 _PUSHED = {"ax", "ay", "az"}  # accelerations of a body
 OF_BODIES = _ALONG | _ABOUT | _PUSHED
 """Words with an axis, of velocities and accelerations."""
 _SPEEDS = {"velocity", "velocities", "vel", "speed", "omega", "w", "qvel", "rate", "gyro", "v", "xv", "av"} | {
-    "angvel",
+    "angvel", "drehzahl", "drehz", "geschwindigkeit",
 } | _ALONG | _ABOUT  # fmt: skip
 _ACCELERATIONS = _PUSHED | {"acceleration", "accelerations", "acc", "accel", "qacc", "ddq", "qdd", "ddot"} | {
     "accelerometer",
 }  # fmt: skip
 _TORQUES = {"tau", "torque", "torques", "effort", "efforts", "force", "forces", "trq", "f", "moment", "load", "thrust"}
+_TORQUES |= {"drehmoment", "kraft"}
 _COMMANDS = {"cmd", "command", "commands", "commanded", "u", "ctrl", "control", "controls", "action", "actions"} | {
     "input", "drive", "applied", "a",
 }  # fmt: skip
 _DUTIES = {"pwm", "duty", "dutycycle", "throttle"}
 _SUPPLIES = {"battery", "batt", "vbat", "vbatt", "supply", "vbus", "vdc", "vcc", "vin"}
 _DESIRED = {"des", "desired", "ref", "reference", "setpoint", "sp", "set", "target", "goal", "demand", "wanted"} | {
-    "requested", "dem",
+    "requested", "dem", "soll", "sollwert",
 }  # fmt: skip
 _MEASURED = {
     "meas",
@@ -99,13 +102,17 @@ _MEASURED = {
     "observation",
     "filtered",
     "sens",
+    "ist",
+    "istwert",
 }
-_CURRENTS = {"current", "currents", "amps", "ampere", "cur", "iq", "i"}
-_VOLTAGES = {"voltage", "voltages", "volt", "volts"}
+_CURRENTS = {"current", "currents", "amps", "ampere", "cur", "iq", "i", "strom"}
+_VOLTAGES = {"voltage", "voltages", "volt", "volts", "spannung"}
 _TIMES = {"time", "t", "timestamp", "timestamps", "stamp", "clock", "elapsed", "seconds", "secs", "millis"} | {
-    "micros", "nanos", "tick", "ticks", "timestep", "sec",
+    "micros", "nanos", "tick", "ticks", "timestep", "sec", "zeit",
 }  # fmt: skip
 _EPISODES = {"episode", "trial", "rollout", "demo", "toss", "experiment", "ep", "traj", "trajectory"}
+LETTERS = {"a", "f", "i", "n", "u", "v"}
+"""Words of one letter, of commands, currents and units, that may also be a joint's: A1, axisA."""
 _OTHERS = {"temp", "temperature", "flag", "error", "err", "status", "mode", "index", "frame", "id", "reward"} | {
     "done", "task", "count", "seq", "step", "contact", "success", "residual", "power", "energy", "noise",
     "humidity", "pressure", "rssi", "sonar", "lidar", "ultrasonic", "fault", "warning", "health",
@@ -146,7 +153,7 @@ def read_name(column: str, own: Collection[str] = ()) -> Label:
         unit, words = _UNITS[last.lower()], words[:-parts]
     if not unit and len(words) > 1:
         for length in (3, 2, 1):  # rad_per_s, rad_s, rad
-            if len(words) > length and (word := _unit_of(words[-length:])):
+            if len(words) > length and not {*words[-length:]} <= {*own} and (word := _unit_of(words[-length:])):
                 unit, words = word, words[:-length]
                 break
     if len(words) == 1 and words[0] in ("us", "ms", "ns"):

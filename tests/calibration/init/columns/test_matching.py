@@ -226,3 +226,23 @@ def test_the_one_column_left_measures_the_one_joint_left(columns: list[str], mea
     matches = match_columns(Machine.of(mujoco.MjModel.from_xml_string(BEAM.format(kind="motor"))), table)
     assert [m.column for m in matches.positions] == measured
     assert all(not m.sure for m in matches.positions if m.column == "kugel_weg")
+
+
+@pytest.mark.parametrize(
+    ("joints", "columns"),
+    [
+        (("A1", "A2"), ("{}_position", "{}_velocity", "{}_current", "{}_setpoint")),
+        (("A1", "A2"), ("position_{}", "velocity_{}", "torque_{}", "setpoint_{}")),
+        (("A1", "A2"), ("Lage_{}_ink", "Drehz_{}", "Strom_{}", "LSoll_{}_ink")),
+        (("axisA", "axisB"), ("{}_position", "{}_velocity", "{}_current", "{}_soll")),
+        (("F1", "F2"), ("{}_position", "{}_rpm", "{}_current_A", "spare_{}")),
+    ],
+)
+def test_joints_of_one_letter_are_no_quantities(joints: tuple[str, str], columns: tuple[str, ...]) -> None:
+    names = [column.format(joint) for column in columns for joint in joints]
+    random = np.random.default_rng(0)
+    matches = match_columns(chain(*joints), {name: random.standard_normal(30) for name in names})
+    taken = [*matches.positions, *matches.velocities, *matches.commands]
+    assert [match.column for match in taken] == names[:6]
+    assert [match.target.split(":")[1].split(".")[0].removeprefix("motor_") for match in taken] == [*joints] * 3
+    assert list(matches.left) == names[6:]
