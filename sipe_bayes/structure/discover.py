@@ -108,7 +108,7 @@ def discover(
     fingerprint = _fingerprint(search, simulator, restriction or Restriction())
     state = DiscoverState(budget=search.budget)
     if checkpoint is not None and checkpoint.exists():
-        enough = search.options.fit_budget / search.options.plain_share
+        enough = search.enough([]) / search.options.plain_share
         state = load_state(checkpoint, DiscoverState, fingerprint).with_budget(search.budget, enough)
     saved = -_SAVE_SECONDS
     while not state.done:

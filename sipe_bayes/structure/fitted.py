@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -30,6 +31,7 @@ from sipe_bayes.structure.scores import scores
 
 # structures differ by nats, and where friction has kinks the last ones come in ever smaller steps
 _COARSE = WindowTuning(tolerance=0.1, rough_tolerance=1e-3, most_steps=30)
+_STEPS = 40  # of a fit, which takes twenty to thirty
 _EDGE = 1e-3  # of the cube: at a bound
 _FLAT_SD = 1e3  # of the cube: stands for a uniform prior beside a normal one
 
@@ -103,6 +105,16 @@ class Fitting:
     prior: Posterior
     seed: int
     num_threads: int
+
+    def enough(self, placed: Sequence[Placed]) -> int:
+        """Rollouts of as many steps of a fit as lead to its optimum."""
+        unknowns = len(self.prior.space) + sum(len(one.parameters) for one in placed)
+        return _STEPS * (unknowns + self._num_start + 2) * len(self.trajectories)
+
+    @cached_property
+    def _num_start(self) -> int:
+        """Unknowns of a window's start."""
+        return self.windows(self.simulator([])).num_start
 
     def simulator(self, placed: Sequence[Placed]) -> Simulator:
         """Of the model with extensions."""

@@ -41,7 +41,7 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
-from sipe_bayes.structure.candidates import Candidate, candidates
+from sipe_bayes.structure.candidates import Candidate, candidates, first
 from sipe_bayes.structure.columns import Column, choices, log_jacobian, moving, unexplained
 from sipe_bayes.structure.extension import Extension, Placed, members, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
@@ -69,7 +69,7 @@ class DiscoverOptions(Options):
     column_share: float = option(0.2, "of the budget, for signs and units at most", above=0, below=1)
     column_budget: int = option(400, "rollouts of one fit with another sign or unit", least=1)
     plain_share: float = option(0.5, "of the budget, for the model as it is at most", above=0, below=1)
-    fit_budget: int = option(2000, "rollouts of one fit", least=1)
+    fit_budget: int = option(2000, "rollouts of one fit, or forty steps of it if that is more", least=1)
     physics_steps: int = option(10000, "of the logs that are searched on, in blocks spread over longer ones", least=1)
 
 
@@ -164,6 +164,10 @@ class StructureSearch:
         foretells = one.held_out is None or other.held_out is None or one.held_out > other.held_out
         return self.total(one) > self.total(other) and foretells
 
+    def enough(self, labels: Sequence[str]) -> int:
+        """Rollouts that the fit of a structure may have."""
+        return max(self.options.fit_budget, self.fitting.enough(self.structure(labels)))
+
     def structure(self, labels: Sequence[str]) -> list[Placed]:
         """The extensions of a structure."""
         return [self._placed[label] for label in labels]
@@ -182,7 +186,7 @@ class StructureSearch:
 
     def _plain(self, state: DiscoverState) -> DiscoverState:
         """The plain model, where it can be fitted at all."""
-        plain, _ = self._try([], min(self.options.fit_budget, int(self.options.plain_share * self.budget)))
+        plain, _ = self._try([], min(self.enough([]), int(self.options.plain_share * self.budget)))
         return replace(state, fitted=() if plain is None else (plain,), phase=Phase.COLUMNS)
 
     def _columns(self, state: DiscoverState) -> DiscoverState:
@@ -206,9 +210,10 @@ class StructureSearch:
             one, rollouts = self._try([column], options.column_budget)
             spent += rollouts
             if one is not None:
-                tried.append((self._of_given(one, [column]), column, one))
+                as_given = one.evidence + log_jacobian(given.trajectories, [column])
+                tried.append((as_given, column, one))
         if plain is None and not tried:
-            given.fit([], None, options.fit_budget)  # raises what keeps the plain model from being fitted
+            given.fit([], None, self.enough([]))  # raises what keeps the plain model from being fitted
         best = max(tried, key=lambda item: item[0], default=None)
         if best is None or (plain is not None and best[0] < plain.evidence + options.column_gain):
             return replace(state, column_rollouts=spent, untried=tuple(columns[number:]))
@@ -231,10 +236,6 @@ class StructureSearch:
             return None, self._fit_rollouts  # as far as it told
         return one, one.rollouts
 
-    def _of_given(self, one: FittedStructure, columns: Sequence[Column]) -> float:
-        """The evidence of logs as they were given."""
-        return one.evidence + log_jacobian(self.given.trajectories, columns)
-
     def _rank(self, state: DiscoverState) -> DiscoverState:
         if len(state.present) >= self.options.most:
             return replace(state, phase=Phase.PRUNE)
@@ -243,14 +244,8 @@ class StructureSearch:
             return state
         promising = [c for c in ranked if c.gain > self.cost + self.options.least_gain]
         untried = [c for c in promising if state.of([*state.present, c.placed.label]) is None]
-        queue = tuple(c.placed.label for c in self._worth(untried))
+        queue = tuple(c.placed.label for c in first(untried, self.options.width, self.options.tied))
         return replace(state, queue=queue, phase=Phase.FIT if queue else Phase.PRUNE)
-
-    def _worth(self, ranked: list[Candidate]) -> list[Candidate]:
-        """The first few, and those that promise as much as the first: a linear promise does not decide between them."""
-        width = self.options.width
-        level = (1 - self.options.tied) * ranked[0].gain if ranked else 0.0
-        return ranked[:width] + [c for c in ranked[width : 2 * width] if c.gain >= level]
 
     def _ranked(
         self, state: DiscoverState, here: FittedStructure, last_resort: bool
@@ -305,7 +300,7 @@ class StructureSearch:
         for each in (state.here, one) if self.fitting.holdout is not None else ():
             if state.judgement(each.labels) is None:
                 own = self.structure(each.labels)
-                most = self.options.fit_budget, self._left(state)
+                most = self.enough(each.labels), self._left(state)
                 log_score, rollouts = self.fitting.log_score(own, each, *most, self._tell)
                 rollouts = self._fit_rollouts if log_score == -np.inf else rollouts
                 state = replace(state, judged=(*state.judged, Judgement(each.labels, log_score, rollouts)))
@@ -389,12 +384,17 @@ class StructureSearch:
         return own + [label for label in one.labels for _ in self._placed[label].parameters]
 
     def _fitted(self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray) -> DiscoverState:
-        left = min(self.options.fit_budget, self._left(state))
+        most, left = self.enough(labels), self._left(state)
+        cut = state.phase if left < most else None
         try:
-            one = self.fitting.fit(self.structure(labels), initial, max(left, 1), self._tell)
+            one = self.fitting.fit(self.structure(labels), initial, max(min(most, left), 1), self._tell)
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
-            short = isinstance(error, BudgetTooSmall) and left < self.options.fit_budget
-            spent, cut = state.failed_rollouts + self._fit_rollouts, state.phase if short else None
+            spent = state.failed_rollouts + self._fit_rollouts
+            cut = cut if isinstance(error, BudgetTooSmall) else None
             return replace(state, failed=(*state.failed, labels), failed_rollouts=spent, cut=cut)
-        short = not one.settled and left < self.options.fit_budget
-        return replace(state, fitted=(*state.fitted, one), cut=state.phase if short else None)
+        if one.settled:
+            return replace(state, fitted=(*state.fitted, one))
+        if state.surpasses(one):  # on the way, with the noise of a stage that is not the last
+            spent = state.failed_rollouts + one.rollouts
+            return replace(state, failed=(*state.failed, labels), failed_rollouts=spent, cut=cut)
+        return replace(state, fitted=(*state.fitted, one), cut=cut)

@@ -128,6 +128,10 @@ class DiscoverState:
         """The fit of a structure, whatever the order of its extensions."""
         return next((one for one in self.fitted if set(one.labels) == set(labels)), None)
 
+    def surpasses(self, one: FittedStructure) -> bool:
+        """Whether one with fewer of its pieces has the greater evidence: then the search has not ended yet."""
+        return any(set(o.labels) < set(one.labels) and o.evidence > one.evidence for o in self.fitted)
+
     def judgement(self, labels: Sequence[str]) -> Judgement | None:
         """What held-out logs say of a structure, whatever the order of its extensions."""
         return next((one for one in self.judged if set(one.labels) == set(labels)), None)
