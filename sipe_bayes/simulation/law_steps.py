@@ -41,6 +41,8 @@ class LawSteps:
         self.rubbing = [bound for bound in self.laws if bound.law.friction]
         self.pushing = [bound for bound in self.laws if not bound.law.friction]
         self.remembering = [bound for bound in self.laws if bound.law.memory]
+        helped = [bound for bound in self.laws if bound.helper >= 0]
+        self.helpers = {b.helper: (b.actuator, int(model.actuator_ctrladr[b.helper])) for b in helped}
         self.dofs = sorted({bound.dof for bound in self.rubbing})
         self.senses = any(bound.sensor >= 0 for bound in self.laws)
         self.control_spec, self.num_dofs = control_spec | _APPLIED, int(model.nv)
@@ -66,6 +68,9 @@ class LawSteps:
         dry = np.stack(friction)
         driven = {b.actuator for b in self.pushing if b.law.kind == "actuator"}
         gears = {actuator: np.array([m.actuator_gear[actuator, 0] for m in models]) for actuator in driven}
+        for helper, (own, _) in self.helpers.items():
+            for model in models:
+                model.actuator_gear[helper] = model.actuator_gear[own]
         inputs, here, states, sensors = np.zeros((batch, 1, width + self.num_dofs)), start, [], []
         for t in range(horizon):
             command = controls[:, t]
@@ -74,6 +79,9 @@ class LawSteps:
             sensed = steps(models, here, inputs, self.control_spec, True)[1][:, 0] if self.senses else None
             for bound in self.pushing:
                 force = bound.law.value(bound.now(numbers, here, command, sensed))
+                if bound.helper >= 0:
+                    inputs[:, 0, self.helpers[bound.helper][1]] += force
+                    continue
                 scale = gears[bound.actuator] if bound.law.kind == "actuator" else 1.0
                 inputs[:, 0, width + bound.dof] += scale * force
             self._rub(friction, self._friction(dry, numbers, here, command, sensed))

@@ -126,6 +126,18 @@ class Machine:
                 sizes[name] = BodySizes(mass, (x, y, z), gyration, reach, _turned(model, data, index))
         return sizes
 
+    @cached_property
+    def alike(self) -> tuple[tuple[str, ...], ...]:
+        """Commanded actuators of one make: alike in all but where they pull and which way."""
+        model, makes = self.model, dict[tuple[float, ...], list[str]]()
+        for name in self.environment.actuators:
+            k = model.actuator(name).id
+            types = (a[k] for a in (model.actuator_trntype, model.actuator_dyntype, model.actuator_gaintype))
+            size = float(np.linalg.norm(model.actuator_gear[k]))
+            numbers = (*model.actuator_gainprm[k], *model.actuator_biasprm[k], *model.actuator_dynprm[k], size)
+            makes.setdefault((*map(float, types), *(round(float(x), 9) for x in numbers)), []).append(name)
+        return tuple(tuple(names) for names in makes.values() if len(names) > 1)
+
     def is_hinge(self, joint: str) -> bool:
         """Whether it turns."""
         return int(self.model.joint(joint).type[0]) == SINGLE[0]

@@ -44,6 +44,8 @@ EXTENSIONS: dict[str, str] = {  # name: module and class
     "force_limit": "actuator.force_limit:ForceLimit",
     "command_limit": "actuator.command_limit:CommandLimit",
     "force_drop": "actuator.force_drop:ForceDrop",
+    "direction_gain": "actuator.direction_gain:DirectionGain",
+    "power": "actuator.power:Power",
     "dead_zone": "actuator.dead_zone:DeadZone",
     "cogging": "actuator.cogging:Cogging",
     "gain": "actuator.gain:Gain",

@@ -36,6 +36,9 @@ NUMBERS = {  # bounds of each number of a law: large against the machines' force
     "cogging_cos": (-0.5, 0.5),
     "cogging_poles": (1.0, 12.0),
     "force_drop": (-0.2, 0.2),
+    "direction_gain": (-0.4, 0.4),
+    "exponent": (0.7, 1.4),
+    "exponent_force": (0.5, 2.0),
     "dead_zone": (0.0, 0.5),
     **dict.fromkeys(Residual.scales, (0.3, 2.0)),
     **{number.attribute: (-0.3, 0.3) for number in Residual.numbers[3:]},
@@ -82,6 +85,8 @@ def plain_value(
         "hysteresis": lambda: -p[0] * sum(memory) / 3,
         "supply_sag": lambda: -force * min(p[0] * total, 1.0),
         "force_drop": lambda: -p[0] * force * abs(force),
+        "direction_gain": lambda: p[0] * abs(force),
+        "power": lambda: np.sign(force) * p[1] * abs(force / p[1]) ** p[0] - force,
         "dead_zone": lambda: -max(-p[0], min(p[0], force)),
     }
     return float(values[name]())
@@ -209,6 +214,41 @@ def test_laws_stand_in_the_model_and_are_declared_once() -> None:
     assert [bound.law.name for bound in laws_of(loaded)] == list(LAWS)
 
 
+THRUSTER = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="x" type="slide" axis="1 0 0"/>
+  <joint name="turn" type="hinge" axis="0 0 1"/><geom size=".1" mass="2"/>
+  <site name="jet" pos="0 .3 0"/></body></worldbody>
+  <actuator><motor name="jet" site="jet" gear="{gear} 0 0 0 0 0"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "force"),
+    [
+        ("direction_gain", 0.3, lambda u: u + 0.3 * abs(u)),
+        ("exponent", 2.0, lambda u: u * abs(u)),
+        ("force_drop", 0.2, lambda u: u - 0.2 * u * abs(u)),
+        ("dead_zone", 0.1, lambda u: u - np.clip(u, -0.1, 0.1)),
+    ],
+)
+def test_a_thruster_at_a_site_has_laws_too(attribute: str, value: float, force: Callable[[float], float]) -> None:
+    """Through the same transmission, also where its gear is unknown: as MuJoCo with the force for a command."""
+    low = 0.1 if attribute == "exponent" else 0.0
+    law, gear = Parameter("p", low, 3.0, targets=(f"actuator:jet.{attribute}",)), 6.0
+    unknown = Parameter("gear", 1.0, 10.0, targets=("actuator:jet.gear",))
+    measured = ["joint:x.position", "joint:turn.position"]
+    simulator = Simulator(MjcfEnvironment.build(THRUSTER.format(gear=2), [law, unknown], ["jet"], measured), 1)
+    commands = np.random.default_rng(0).uniform(-1, 1, (1, 20, 1))
+    theta = simulator.space.normalise(np.array([[value, gear]]))
+    run = simulator.rollout(theta, commands, simulator.default_state()[None], 0.01)
+    model = mujoco.MjModel.from_xml_string(THRUSTER.format(gear=gear))
+    data, seen = mujoco.MjData(model), []
+    for command in commands[0, :, 0]:
+        data.ctrl[:] = force(float(command))
+        for _ in range(round(0.01 / model.opt.timestep)):
+            mujoco.mj_step(model, data)
+        seen.append(data.qpos.copy())
+    np.testing.assert_allclose(run.observations[0, 1:], seen, rtol=1e-9, atol=1e-12)
+
+
 BALL = """<mujoco><worldbody><body><joint name="ball" type="ball"/><geom size=".1"/></body></worldbody>
   <actuator><motor name="motor" joint="ball" gear="1 0 0"/></actuator></mujoco>"""
 NO_SENSOR = MACHINES["pendulum"].xml.replace(
@@ -224,7 +264,7 @@ TOO_MANY = NO_SENSOR.replace('data=".1"', 'data=".1 .2"')
     [
         ("joint:ball.load_friction", "only hinge and slide joints"),
         ("joint:ball.cogging_sin", "only hinge and slide joints"),
-        ("actuator:motor.force_drop", "only hinge and slide joints, and actuators of one"),
+        ("actuator:motor.force_drop", "only hinge and slide joints, and actuators of anything but a ball"),
         ("joint:none.load_friction", "no joint 'none'"),
     ],
 )

@@ -38,6 +38,12 @@ PLANTED = [
         "lag:motor", {"actuator:motor.lag": 0.05}, ("offset", "dry_friction"), edits=(FilteredCommand(("motor",), 0.6),)
     ),
     Plant("dead_zone:motor", {"actuator:motor.dead_zone": 0.1}, ("direction_friction", "force_drop")),
+    Plant("direction_gain:motor", {"actuator:motor.direction_gain": 0.3}, ("offset", "dead_zone", "force_drop")),
+    Plant(
+        "power:motor",
+        {"actuator:motor.exponent": 1.6, "actuator:motor.exponent_force": 1.0},
+        ("force_drop", "dead_zone"),
+    ),
     Plant(
         "presliding:hinge",
         {"joint:hinge.presliding_friction": 0.15, "joint:hinge.presliding_range": 0.05},
@@ -128,7 +134,10 @@ def test_what_is_planted_at_two_joints_is_found(
 
 @pytest.mark.parametrize("plant", PLANTED, ids=lambda plant: plant.label)
 def test_what_is_planted_is_found_and_its_size_is_right(plant: Plant) -> None:
-    least = {target: size / 9 if target.endswith(("_range", "_loss")) else 0.0 for target, size in plant.sizes.items()}
+    least = {
+        target: size / 9 if target.endswith(("_range", "_loss", "exponent", "exponent_force")) else 0.0
+        for target, size in plant.sizes.items()
+    }
     extra = [Parameter(t.rpartition(".")[2], least[t], 2 * size, targets=(t,)) for t, size in plant.sizes.items()]
     truth = [0.6, 0.08, *([] if plant.rotor is None else [plant.rotor])]
     own = [Parameter("rotor", 0.0, 0.1, targets=("joint:hinge.armature",))][: len(truth) - 2]

@@ -21,6 +21,7 @@ from sipe_bayes.envs.internal.states import declare_start
 from sipe_bayes.envs.laws.base import SINGLE, Law, LawError, Now
 from sipe_bayes.envs.laws.registry import LAW_OF, LAWS
 
+_BY_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _MEMORY = int(mujoco.mjtDyn.mjDYN_USER)  # an actuator whose activations nothing in MuJoCo changes
 _SURE = 10.0  # at a tenth of the usual speed a direction counts
 _MEMORY_SD = 0.6  # of what a law remembers, which lies between -1 and 1
@@ -35,8 +36,10 @@ class BoundLaw:
         numbers: slice of ``numeric_data``.
         position: column of the physics state.
         velocity: column of the physics state.
-        dof: where it acts.
+        dof: where it acts; -1 where a helper does.
         actuator: that drives the joint, or whose law it is; -1 without.
+        helper: actuator beside one that drives no single joint, which gives the law's force through the same
+            transmission; -1 where ``dof`` is where it acts.
         control: column of the controls; -1 without.
         sensor: column of the sensordata; -1 where the law senses nothing.
         peers: columns of the sensordata of all objects with this law.
@@ -49,6 +52,7 @@ class BoundLaw:
     velocity: int
     dof: int
     actuator: int
+    helper: int
     control: int
     sensor: int
     peers: tuple[int, ...]
@@ -83,6 +87,8 @@ def declare(spec: mujoco.MjSpec, kind: str, name: str, law: Law) -> None:
     if any(numeric.name == label for numeric in spec.numerics):
         return
     spec.add_numeric(name=label, data=[number.neutral for number in law.numbers], size=len(law.numbers))
+    if kind == "actuator":
+        _help(spec, name, label)
     if law.senses == "force":
         sensor = mujoco.mjtSensor.mjSENS_ACTUATORFRC
         spec.add_sensor(name=label, type=sensor, objtype=mujoco.mjtObj.mjOBJ_ACTUATOR, objname=name)
@@ -100,6 +106,16 @@ def declare(spec: mujoco.MjSpec, kind: str, name: str, law: Law) -> None:
         memory.dyntype, memory.actdim = mujoco.mjtDyn.mjDYN_USER, law.memory
         memory.gainprm = np.zeros(len(memory.gainprm))
         declare_start(spec, f"actuator:{label}", [_MEMORY_SD] * law.memory)
+
+
+def _help(spec: mujoco.MjSpec, name: str, label: str) -> None:
+    """An actuator of a force of its own, beside one that drives no single joint, through the same transmission."""
+    own = spec.actuator(name)
+    if own is None or int(own.trntype) == _BY_JOINT:
+        return
+    helper = spec.add_actuator(name=label, trntype=own.trntype, target=own.target)
+    helper.refsite, helper.slidersite, helper.cranklength = own.refsite, own.slidersite, own.cranklength
+    helper.gear = own.gear
 
 
 @dataclass(frozen=True)
@@ -150,16 +166,21 @@ def _bound(model: mujoco.MjModel, law: Law, owner: str, numbers: slice, label: s
         joint, actuator = index, _driver(model, index)
     else:
         joint, actuator = driven_joint(model, index), index
-    if joint < 0 or int(model.jnt_type[joint]) not in SINGLE:
-        raise LawError(f"target {label!r}: only hinge and slide joints, and actuators of one, have this attribute")
+    helper = mujoco.mj_name2id(model, kind, label) if law.kind == "actuator" and joint < 0 else -1
+    if helper < 0 and (joint < 0 or int(model.jnt_type[joint]) not in SINGLE):
+        raise LawError(
+            f"target {label!r}: only hinge and slide joints, and actuators of anything but a ball, have this attribute"
+        )
     sensor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, label) if law.senses else -1
     if law.senses and sensor < 0:
         raise LawError(f"model: the numeric {label!r} wants a sensor of the same name")
     column = int(model.sensor_adr[sensor]) + (2 if law.senses == "torque" else 0) if sensor >= 0 else -1
     control = int(model.actuator_ctrladr[actuator]) if actuator >= 0 else -1
-    position, dof = 1 + int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
     memory = _memory(model, law, label)
-    return BoundLaw(law, numbers, position, 1 + model.nq + dof, dof, actuator, control, column, (), memory)
+    if helper >= 0:
+        return BoundLaw(law, numbers, 0, 0, -1, actuator, helper, control, column, (), memory)
+    position, dof = 1 + int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+    return BoundLaw(law, numbers, position, 1 + model.nq + dof, dof, actuator, -1, control, column, (), memory)
 
 
 def _memory(model: mujoco.MjModel, law: Law, label: str) -> slice:
@@ -174,7 +195,7 @@ def _memory(model: mujoco.MjModel, law: Law, label: str) -> slice:
 
 def driven_joint(model: mujoco.MjModel, actuator: int) -> int:
     """The joint that an actuator drives by itself, or -1."""
-    if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
+    if int(model.actuator_trntype[actuator]) != _BY_JOINT:
         return -1
     return int(model.actuator_trnid[actuator, 0])
 

@@ -2,6 +2,8 @@ r"""Forces of motors that MJCF has no element for.
 
 - ``cogging``: a force a sin(n q) + b cos(n q).
 - ``force_drop``: the actuator's force falls short by p f \|f\|.
+- ``direction_gain``: it is larger by p one way and smaller the other: p \|f\|.
+- ``power``: it goes with a power n of the model's, sign(f) F \|f / F\|^n; what the model has at F it has, too.
 - ``dead_zone``: of the actuator's force up to d, either way, nothing arrives, and of more the rest.
 - ``supply_sag``: it falls short by p f F, with F the forces of all actuators on one supply, added up by size: their
   currents lower the voltage that each of them gets.
@@ -40,6 +42,30 @@ class ForceDrop(Law):
     def value(self, now: Now) -> FloatArray:
         """-p f |f|."""
         return -now.numbers[:, 0] * now.sensed * np.abs(now.sensed)
+
+
+class DirectionGain(Law):
+    """An actuator that is stronger one way than the other."""
+
+    name, kind, senses, friction = "direction_gain", "actuator", "force", False
+    numbers = (Number("direction_gain", "1"),)
+
+    def value(self, now: Now) -> FloatArray:
+        """The force p |f|."""
+        return now.numbers[:, 0] * np.abs(now.sensed)
+
+
+class Power(Law):
+    """An actuator whose force goes with a power of the model's, as a propeller's with the square of its speed."""
+
+    name, kind, senses, friction = "power", "actuator", "force", False
+    numbers = (Number("exponent", "1", 1.0, minimum=0.1), Number("exponent_force", "force", 1.0, shape=True))
+
+    def value(self, now: Now) -> FloatArray:
+        """The force f (|f / F|^(n - 1) - 1)."""
+        exponent, whole = now.numbers.T
+        share = np.abs(np.where(now.sensed == 0, whole, now.sensed) / whole)
+        return np.asarray(now.sensed * (share ** (exponent - 1) - 1))
 
 
 class DeadZone(Law):

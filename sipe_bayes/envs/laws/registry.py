@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sipe_bayes.envs.laws.base import Law
-from sipe_bayes.envs.laws.drive import Cogging, DeadZone, ForceDrop, SupplySag
+from sipe_bayes.envs.laws.drive import Cogging, DeadZone, DirectionGain, ForceDrop, Power, SupplySag
 from sipe_bayes.envs.laws.friction import DirectionDamping, DirectionFriction, LoadFriction, Stribeck
 from sipe_bayes.envs.laws.memory import Hysteresis, Presliding
 from sipe_bayes.envs.laws.residual import Residual
@@ -19,6 +19,8 @@ LAWS: dict[str, Law] = {
         Hysteresis(),
         Cogging(),
         ForceDrop(),
+        DirectionGain(),
+        Power(),
         DeadZone(),
         SupplySag(),
         Residual(),

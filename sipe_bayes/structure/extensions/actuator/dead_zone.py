@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.structure.extension import Extension
+from sipe_bayes.structure.extension import Extension, members
 from sipe_bayes.structure.machine import Machine
 
 
@@ -21,12 +21,17 @@ class DeadZone(Extension):
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """Up to the usual force."""
+        names = members(site)
         return (
             Parameter(
                 f"{site}.dead_zone",
                 0.0,
-                machine.forces[site],
-                targets=(f"actuator:{site}.dead_zone",),
+                max(machine.forces[name] for name in names),
+                targets=tuple(f"actuator:{name}.dead_zone" for name in names),
                 description="force of which nothing arrives",
             ),
         )
+
+    def groups(self, machine: Machine) -> tuple[tuple[str, ...], ...]:
+        """Actuators of one make."""
+        return machine.alike

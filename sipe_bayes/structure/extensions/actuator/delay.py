@@ -32,6 +32,10 @@ class Delay(Extension):
             ),
         )
 
+    def groups(self, machine: Machine) -> tuple[tuple[str, ...], ...]:
+        """Actuators of one make."""
+        return machine.alike
+
     def imitators(self, site: str) -> tuple[str, ...]:
         """A first-order lag."""
         return tuple(f"actuator:{name}.lag" for name in members(site))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.structure.extension import Extension
+from sipe_bayes.structure.extension import Extension, members
 from sipe_bayes.structure.machine import Machine
 
 
@@ -21,13 +21,18 @@ class ForceDrop(Extension):
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """Up to a half at twice the usual force."""
-        most = 0.25 / machine.forces[site]
+        names = members(site)
+        most = 0.25 / max(machine.forces[name] for name in names)
         return (
             Parameter(
                 f"{site}.force_drop",
                 -most,
                 most,
-                targets=(f"actuator:{site}.force_drop",),
+                targets=tuple(f"actuator:{name}.force_drop" for name in names),
                 description="relative loss per force",
             ),
         )
+
+    def groups(self, machine: Machine) -> tuple[tuple[str, ...], ...]:
+        """Actuators of one make."""
+        return machine.alike

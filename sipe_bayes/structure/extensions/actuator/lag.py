@@ -66,6 +66,10 @@ class Lag(Extension):
         names = members(site)
         return FilteredCommand(names, UNSETTLED * (max(machine.commands[name] for name in names) or 1.0))
 
+    def groups(self, machine: Machine) -> tuple[tuple[str, ...], ...]:
+        """Actuators of one make."""
+        return machine.alike
+
     def imitators(self, site: str) -> tuple[str, ...]:
         """A delay."""
         return tuple(f"actuator:{name}.delay" for name in members(site))
