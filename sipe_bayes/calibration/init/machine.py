@@ -53,7 +53,8 @@ class Actuator:
 
     That is the end of its ctrlrange, which begins at zero or as far below; None where it has no such range.
     limits: its ctrlrange, to which commands are clipped; None where it has none. tendon: whether it pulls a tendon,
-    the first of whose joints is its joint where these make it up. thrust: whether it pushes a free body at a site.
+    the first of whose joints is its joint where these make it up. thrust: whether it pushes at a site; flies: whether
+    what it pushes moves freely.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Actuator:
     limits: tuple[float, float] | None = None
     tendon: bool = False
     thrust: bool = False
+    flies: bool = False
 
     @property
     def turns(self) -> bool:
@@ -113,6 +115,7 @@ class Machine:
                 _limits_of(model, i),
                 int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON),
                 _is_thrust(model, i),
+                _is_thrust(model, i) and _is_free(model, i),
             )
             for k, i in enumerate(i for i in range(model.nu) if model.actuator(i).name)
         ]
@@ -243,14 +246,17 @@ def _pulls(model: mujoco.MjModel, data: mujoco.MjData) -> FloatArray:
 
 
 def _is_thrust(model: mujoco.MjModel, index: int) -> bool:
-    """Whether an actuator pushes a body that moves freely at a site of it, in no other site's axes."""
-    site, other = model.actuator_trnid[index].tolist()
-    if int(model.actuator_trntype[index]) != int(mujoco.mjtTrn.mjTRN_SITE) or other >= 0:
+    """Whether an actuator pushes a body at a site of it, in no other site's axes."""
+    if int(model.actuator_trntype[index]) != int(mujoco.mjtTrn.mjTRN_SITE) or model.actuator_trnid[index, 1] >= 0:
         return False
-    body = int(model.body_weldid[model.site_bodyid[site]])
+    return bool(model.actuator_gear[index, :3].any())
+
+
+def _is_free(model: mujoco.MjModel, index: int) -> bool:
+    """Whether the body of an actuator's site moves freely."""
+    body = int(model.body_weldid[model.site_bodyid[model.actuator_trnid[index, 0]]])
     joint = int(model.body_jntadr[body])
-    free = joint >= 0 and int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE)
-    return free and bool(model.actuator_gear[index, :3].any())
+    return joint >= 0 and int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE)
 
 
 def drive_of(model: mujoco.MjModel, index: int) -> Drive:

@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from sipe_bayes.calibration.init.columns.match import Match
+from sipe_bayes.calibration.init.columns.matching import match_columns
 from sipe_bayes.calibration.init.columns.names import read_name
 from sipe_bayes.calibration.init.draft import Reading, Unknown
 from sipe_bayes.calibration.init.fits import Fit, delay_of
 from sipe_bayes.calibration.init.machine import Machine, Sizes
+from sipe_bayes.calibration.init.readings import first_readings
+from sipe_bayes.calibration.init.tables import Clock
 from sipe_bayes.calibration.init.unknowns.candidates import candidates, springs
 from sipe_bayes.calibration.init.unknowns.choice import roomy, sprung, told_apart
 
@@ -146,3 +149,25 @@ def test_a_driven_joint_that_only_its_fellow_measures_is_asked_for() -> None:
     readings = [Reading(Match((n,), target, read_name(n, set()), 1.0), "m") for n, target in targets.items()]
     names = {u.name for u in candidates(model, machine, readings, Sizes.of(model, machine, None, None))}
     assert {"l_mass", "r_mass", "left_damping", "right_damping"} <= names
+
+
+def test_thrusters_of_what_slides_and_turns_share_a_gain_that_nothing_tells() -> None:
+    """As those of a free body: shares of a thrust are no newton metres."""
+    raft = """<mujoco><worldbody><body name="raft"><joint name="x" type="slide" axis="1 0 0"/>
+      <joint name="turn" axis="0 0 1"/><geom size=".1" mass="9"/><site name="left" pos="0 .3 0"/>
+      <site name="right" pos="0 -.3 0"/></body></worldbody>
+      <actuator><motor name="port" site="left" gear="40 0 0 0 0 0"/>
+      <motor name="starboard" site="right" gear="40 0 0 0 0 0"/></actuator></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(raft)
+    machine = Machine.of(model)
+    random = np.random.default_rng(0)
+    names = ("x_position", "turn_position", "port", "starboard")
+    table = {name: random.standard_normal(50) for name in names}
+    clock = Clock("t", "s", 0.01, "")
+    measurements, commands = first_readings(machine, match_columns(machine, table), table, {}, clock)
+    assert [command.unit for command in commands] == ["1", "1"]
+    asked = {
+        u.name for u in candidates(model, machine, [*measurements, *commands], Sizes.of(model, machine, None, None))
+    }
+    assert {"rotors_gain", "raft_mass"} <= asked
+    assert not {"port_gain", "starboard_gain"} & asked
