@@ -222,7 +222,7 @@ ADVICE: dict[Code, str] = {
     ),
     Code.LOG_CLOCK: "Nothing to do.",
     Code.LOG_RESAMPLED: "Nothing to do, unless the jitter is as large as the delays that you look for.",
-    Code.LOG_GAP: "Nothing to do where it is short. Cut the log there by `span` if the command did change in the gap.",
+    Code.LOG_GAP: "Nothing to do where it is short, or rows are there. Else cut it out by `span` if commands changed.",
     Code.LOG_RATE: "Nothing to do.",
     Code.LOG_MISSING: "Nothing to do: masked samples are not fitted.",
     Code.LOG_BLANK_COMMANDS: "See that a blank means 'as before' in your log and not 'off'.",
@@ -234,7 +234,7 @@ ADVICE: dict[Code, str] = {
     ),
     Code.LOG_WILD: "Nothing to do for a few. For many look at the sensor, its cable and its driver.",
     Code.LOG_SLOW: "Record anew at 100 Hz or more; no method finds in a log what is not there.",
-    Code.LOG_CLIPPED: "A saturated sensor lies. Cut those parts out by `span`, or send less.",
+    Code.LOG_CLIPPED: "A saturated sensor lies: cut those parts out by `span`, or send less. Rest there is no harm.",
     Code.PRIOR_OF_MIXTURE: "Give the logs of both runs to one fit instead, if the modes lie far apart.",
     Code.PRIOR_COUNTED_TWICE: "Take those logs out of this run, or drop `prior.from`.",
     Code.STRUCTURE_UNCERTAIN: (

@@ -332,7 +332,7 @@ class Code(Enum):
     )
     LOG_CLOCK = note("{samples} samples passed through unchanged at {rate}; clock jitter up to {jitter_ms:.3g} ms")
     LOG_RESAMPLED = note("{samples} samples at {own_rate}, clock jitter up to {jitter_ms:.3g} ms, resampled to {rate}")
-    LOG_GAP = note("no measurement from {start:.3f} to {stop:.3f} s; commands are held there")
+    LOG_GAP = note("no measurement from {start:.3f} to {stop:.3f} s; where rows are missing, commands are held")
     LOG_RATE = note("{channel} comes at {rate}, in one of {every} samples; between them it is not fitted")
     LOG_MISSING = note("{channel}: {missing} of {samples} samples missing, masked")
     LOG_BLANK_COMMANDS = note("{channel}: {blank} blank commands, the one before is held")
@@ -353,7 +353,7 @@ class Code(Enum):
         "{channels} were recorded at {rate}: too slowly to see what friction and delays do, whose estimates will be "
         "biased; log joints and bodies at 100 Hz or more"
     )
-    LOG_CLIPPED = note("{channel}: {clipped} samples stuck at an extreme value, perhaps saturated")
+    LOG_CLIPPED = note("{channel}: {clipped} samples stuck at an extreme value: saturated, or at rest")
 
     # what went in and what came out
     PRIOR_OF_MIXTURE = caution(

@@ -90,8 +90,8 @@ def test_what_several_logs_say_of_a_channel_is_one_line() -> None:
         reports.append(LogReport(name, "", "", 1.0, 1.0, 2, 0.0, False, clipped=clipped, findings=notes))
     noticed = of_logs(reports)
     assert [item.text for item in noticed] == [
-        "logs run0, run1, run2 and 2 more: q: 25 samples stuck at an extreme value, perhaps saturated",
-        "log run2: w: 7 samples stuck at an extreme value, perhaps saturated",
+        "logs run0, run1, run2 and 2 more: q: 25 samples stuck at an extreme value: saturated, or at rest",
+        "log run2: w: 7 samples stuck at an extreme value: saturated, or at rest",
     ]
     assert {item.severity for item in noticed} == {Severity.CAUTION}
     assert Findings(noticed).kinds == [f"{noticed[0].text} (and so 1 more)"], "one line on the terminal"
