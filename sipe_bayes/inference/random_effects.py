@@ -20,8 +20,9 @@ https://doi.org/10.1214/06-BA117A, section 5, on the half-normal's kin.
 
 Deviations:
 
-- Each log's likelihood is its normal at its own optimum, of the directions of which the log says more than a uniform
-  prior: along a ridge, as of a gain and the masses that it moves, the optimum of a linear model may lie anywhere.
+- Each log's likelihood is its normal at its own optimum, but for directions of which the log says less than a uniform
+  prior while its optimum lies beyond the cube: along a ridge, as of a gain and the masses that it moves, a linear model
+  may have it anywhere.
 - A new log's theta is restricted to the cube; those of the logs at hand are not.
 """
 
@@ -72,9 +73,11 @@ class LogEstimate:
 
     @property
     def determined(self) -> LogEstimate:
-        """With the directions alone of which the log says more than a uniform prior; in the others in the middle."""
+        """Without directions of which it says less than a uniform prior, with its optimum there beyond the cube."""
         precision, axes = np.linalg.eigh(self.information)
-        axes = axes[:, precision > UNIFORM_PRECISION]
+        along = axes.T @ self.mean
+        beyond = (along < np.minimum(axes, 0).sum(0)) | (along > np.maximum(axes, 0).sum(0))
+        axes = axes[:, (precision > UNIFORM_PRECISION) | ~beyond]
         mean = 0.5 + axes @ (axes.T @ (self.mean - 0.5))
         return LogEstimate(self.name, mean, axes @ (axes.T @ self.information @ axes) @ axes.T)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -108,13 +107,8 @@ class Fitting:
 
     def enough(self, placed: Sequence[Placed]) -> int:
         """Rollouts of as many steps of a fit as lead to its optimum."""
-        unknowns = len(self.prior.space) + sum(len(one.parameters) for one in placed)
-        return _STEPS * (unknowns + self._num_start + 2) * len(self.trajectories)
-
-    @cached_property
-    def _num_start(self) -> int:
-        """Unknowns of a window's start."""
-        return self.windows(self.simulator([])).num_start
+        windows = self.windows(self.simulator(placed))
+        return _STEPS * (windows.num_theta + windows.num_start + 2) * len(self.trajectories)
 
     def simulator(self, placed: Sequence[Placed]) -> Simulator:
         """Of the model with extensions."""

@@ -132,10 +132,14 @@ class Machine:
         model, makes = self.model, dict[tuple[float, ...], list[str]]()
         for name in self.environment.actuators:
             k = model.actuator(name).id
-            types = (a[k] for a in (model.actuator_trntype, model.actuator_dyntype, model.actuator_gaintype))
-            size = float(np.linalg.norm(model.actuator_gear[k]))
-            numbers = (*model.actuator_gainprm[k], *model.actuator_biasprm[k], *model.actuator_dynprm[k], size)
-            makes.setdefault((*map(float, types), *(round(float(x), 9) for x in numbers)), []).append(name)
+            joint = driven_joint(model, k)
+            moved = int(model.jnt_type[joint]) if joint >= 0 else -1
+            kinds = (moved, model.actuator_trntype[k], model.actuator_dyntype[k], model.actuator_gaintype[k])
+            sizes = (np.linalg.norm(model.actuator_gear[k]), model.actuator_biastype[k])
+            own = (model.actuator_gainprm, model.actuator_biasprm, model.actuator_dynprm)
+            limits = (model.actuator_ctrlrange, model.actuator_forcerange)
+            numbers = np.concatenate([kinds, sizes, *(array[k] for array in (*own, *limits))])
+            makes.setdefault(tuple(np.round(numbers, 9).tolist()), []).append(name)
         return tuple(tuple(names) for names in makes.values() if len(names) > 1)
 
     def is_hinge(self, joint: str) -> bool:

@@ -243,7 +243,7 @@ class StructureSearch:
         if state.cut is not None:
             return state
         promising = [c for c in ranked if c.gain > self.cost + self.options.least_gain]
-        untried = [c for c in promising if state.of([*state.present, c.placed.label]) is None]
+        untried = [c for c in promising if not state.is_tried((*state.present, c.placed.label))]
         queue = tuple(c.placed.label for c in first(untried, self.options.width, self.options.tied))
         return replace(state, queue=queue, phase=Phase.FIT if queue else Phase.PRUNE)
 

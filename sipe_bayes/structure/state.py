@@ -128,6 +128,10 @@ class DiscoverState:
         """The fit of a structure, whatever the order of its extensions."""
         return next((one for one in self.fitted if set(one.labels) == set(labels)), None)
 
+    def is_tried(self, labels: Sequence[str]) -> bool:
+        """Whether a structure was fitted, or could not be, whatever the order of its extensions."""
+        return any(set(labels) == set(one) for one in (*(o.labels for o in self.fitted), *self.failed))
+
     def surpasses(self, one: FittedStructure) -> bool:
         """Whether one with fewer of its pieces has the greater evidence: then the search has not ended yet."""
         return any(set(o.labels) < set(one.labels) and o.evidence > one.evidence for o in self.fitted)

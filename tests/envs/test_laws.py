@@ -217,9 +217,19 @@ def test_laws_stand_in_the_model_and_are_declared_once() -> None:
 THRUSTER = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="x" type="slide" axis="1 0 0"/>
   <joint name="turn" type="hinge" axis="0 0 1"/><geom size=".1" mass="2"/>
   <site name="jet" pos="0 .3 0"/></body></worldbody>
-  <actuator><motor name="jet" site="jet" gear="{gear} 0 0 0 0 0"/></actuator></mujoco>"""
+  <actuator><motor name="jet" site="jet" gear="{gear} 0 0 0 0 0" forcelimited="false"
+  ctrllimited="false"/></actuator></mujoco>"""
 
 
+DEFAULTS = {
+    "none": "",
+    "servo": '<position kp="100"/>',
+    "weak": '<general gainprm="50" ctrllimited="true" ctrlrange="-.1 .1" forcelimited="true" forcerange="-.2 .2"/>',
+    "slow": '<general dyntype="filter" dynprm=".1"/>',
+}
+
+
+@pytest.mark.parametrize("default", DEFAULTS)
 @pytest.mark.parametrize(
     ("attribute", "value", "force"),
     [
@@ -229,13 +239,16 @@ THRUSTER = """<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="x" 
         ("dead_zone", 0.1, lambda u: u - np.clip(u, -0.1, 0.1)),
     ],
 )
-def test_a_thruster_at_a_site_has_laws_too(attribute: str, value: float, force: Callable[[float], float]) -> None:
-    """Through the same transmission, also where its gear is unknown: as MuJoCo with the force for a command."""
+def test_a_thruster_at_a_site_has_laws_too(
+    attribute: str, value: float, force: Callable[[float], float], default: str
+) -> None:
+    """Through the same transmission, also where its gear is unknown, whatever a model's defaults give to actuators."""
     low = 0.1 if attribute == "exponent" else 0.0
     law, gear = Parameter("p", low, 3.0, targets=(f"actuator:jet.{attribute}",)), 6.0
     unknown = Parameter("gear", 1.0, 10.0, targets=("actuator:jet.gear",))
     measured = ["joint:x.position", "joint:turn.position"]
-    simulator = Simulator(MjcfEnvironment.build(THRUSTER.format(gear=2), [law, unknown], ["jet"], measured), 1)
+    xml = THRUSTER.replace("<worldbody>", f"<default>{DEFAULTS[default]}</default><worldbody>")
+    simulator = Simulator(MjcfEnvironment.build(xml.format(gear=2), [law, unknown], ["jet"], measured), 1)
     commands = np.random.default_rng(0).uniform(-1, 1, (1, 20, 1))
     theta = simulator.space.normalise(np.array([[value, gear]]))
     run = simulator.rollout(theta, commands, simulator.default_state()[None], 0.01)

@@ -119,6 +119,16 @@ def test_where_a_ridge_ends_in_a_linear_model_does_not_count() -> None:
     assert float(effects.common.stddev.max()) < 0.1
 
 
+@pytest.mark.parametrize("precision", [11.9, 12.1])
+def test_many_logs_that_each_say_little_say_much_together(precision: float) -> None:
+    """With no cliff where one says as much as a uniform prior does."""
+    means = np.random.default_rng(3).normal(0.4, 0.1, 20).tolist()
+    effects = random_effects(logs(means, [precision**-0.5] * 20), default_prior(space(1)))
+    print(effects.common.mean, effects.common.stddev)
+    assert float(effects.common.mean) == pytest.approx(np.mean(means), abs=0.03)
+    assert float(effects.common.stddev) < 0.1
+
+
 def test_one_log_is_refused() -> None:
     with pytest.raises(ValueError, match=r"logs: expected two or more, got 1"):
         random_effects(logs([0.5], [0.1]), default_prior(space(1)))

@@ -116,3 +116,21 @@ def test_an_interval_reaches_as_far_as_the_optimum(theta: float, wide: bool) -> 
     one = replace(structure("", 0.0), theta=np.array([theta]), mean=mean, covariance=covariance)
     expected = np.hypot(0.05, 0.4) if wide else 0.05
     assert np.sqrt(one.spanned[0, 0]) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "settled", "kept"), [(50.0, False, False), (150.0, False, True), (50.0, True, True)]
+)
+def test_a_fit_that_was_cut_short_below_its_own_part_says_nothing(evidence: float, settled: bool, kept: bool) -> None:
+    """It may have more evidence than it had on the way, not less than with a piece fewer; it is not tried again."""
+    one = replace(structure("ab", evidence), settled=settled, rollouts=70)
+    fitting: Any = SimpleNamespace(enough=lambda placed: 90, fit=lambda *given: one)
+    search = StructureSearch(fitting, (), budget=10_000)
+    begun = DiscoverState(Phase.FIT, (structure("", 0), structure("a", 100)), ("a",))
+    with mock.patch.object(search, "structure", return_value=[]):
+        after = search._fitted(begun, ("a", "b"), np.zeros(3))
+    assert (after.of("ab") is one) is kept
+    assert (after.failed == (("a", "b"),)) is not kept
+    assert after.is_tried("ba")
+    assert after.rollouts == begun.rollouts + 70
+    assert after.cut is None

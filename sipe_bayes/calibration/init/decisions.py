@@ -64,8 +64,7 @@ def decide(
         return draft
     case = Case(draft, machine, trial, layout, trial.theta, tell)
     ranking = ranking or ranked(case, asked)
-    thrust = any(actuator.flies for actuator in machine.actuators)
-    flies = bool(trial.simulator.environment.rotations) and not thrust  # contacts are not seen in short windows
+    flies = bool(trial.simulator.environment.rotations) and not machine.flies  # contacts are not seen in short windows
     rivals = [] if flies else rivals_of(ranking)
     if rivals:
         ranking, theta = fitted(case, asked, ranking, rivals)

@@ -322,8 +322,7 @@ def questions(draft: Draft, machine: Machine) -> list[Question]:
         if len(reading.match.columns) == 1 and reading.match.target not in one_way:
             against = _TURNED if reading.turning else _UNLIKELY
             signs.append(Question((k,), (reading.sign, turned(reading.sign)), against))
-    flown = any(actuator.flies for actuator in machine.actuators)
-    usual = _FLOWN if flown else _UNLIKELY
+    usual = _FLOWN if machine.flies else _UNLIKELY
     units = [
         Question(tuple(members), scales, _CUSTOM if scales[0].ends else usual)
         for (_, scales), members in groups.items()

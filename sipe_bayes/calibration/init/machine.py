@@ -10,6 +10,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.envs.kinds.tendons import tendon_arms
+from sipe_bayes.envs.laws.bound import is_of_law
 
 _GRAVITY, _BRISK = 9.81, 10.0  # m/s^2, rad/s^2 or m/s^2: motions of unknown machines
 _NO_MASS = 0.01  # of all that a body carries
@@ -87,6 +88,11 @@ class Machine:
     bodies: tuple[str, ...]  # that move freely
     sensors: tuple[tuple[str, str], ...]  # name and quantity of those of three numbers
 
+    @property
+    def flies(self) -> bool:
+        """Whether thrust moves what is free."""
+        return any(actuator.flies for actuator in self.actuators)
+
     @classmethod
     def of(cls, model: mujoco.MjModel) -> Machine:
         """Read a compiled model."""
@@ -117,7 +123,7 @@ class Machine:
                 _is_thrust(model, i),
                 _is_thrust(model, i) and _is_free(model, i),
             )
-            for k, i in enumerate(i for i in range(model.nu) if model.actuator(i).name)
+            for k, i in enumerate(_commanded(model))
         ]
         free = [i for i in range(model.njnt) if int(model.jnt_type[i]) not in scalar]
         bodies = [model.body(int(model.jnt_bodyid[i])).name for i in free]
@@ -243,6 +249,12 @@ def _pulls(model: mujoco.MjModel, data: mujoco.MjData) -> FloatArray:
     at = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
     np.add.at(pulls, model.actuator_trnid[at, 0], np.abs(data.actuator_force * model.actuator_gear[:, 0])[at])
     return np.asarray(pulls)
+
+
+def _commanded(model: mujoco.MjModel) -> list[int]:
+    """Actuators with a name, of no law."""
+    names = [model.actuator(i).name for i in range(model.nu)]
+    return [i for i, name in enumerate(names) if name and not is_of_law(name)]
 
 
 def _is_thrust(model: mujoco.MjModel, index: int) -> bool:

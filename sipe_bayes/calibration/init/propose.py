@@ -388,6 +388,6 @@ def _window(machine: Machine, logs: Sequence[Trajectory], trial: Trial) -> tuple
         return "log", "each log as one: they are short"
     swing = trial.length * logs[0].dt / share_of(machine)
     part = _COUPLED if len(machine.joints) > 1 and share_of(machine) < _COUPLED else _SINGLE
-    part = _FLOWN if any(actuator.flies for actuator in machine.actuators) else part
+    part = _FLOWN if machine.flies else part
     length = float(np.clip(part * swing, max(0.1, 20 * logs[0].dt), min(2.0, min(durations) / 5)))
     return float(f"{length:.2g}"), f"s; the motion goes to and fro in about {swing:.2g} s"

@@ -51,7 +51,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.misfit.tolerances import IMITATED
-from sipe_bayes.posterior import Particles, Posterior
+from sipe_bayes.posterior import GaussianMixture, Particles, Posterior
 from sipe_bayes.posterior.truncated_normal import interval_quantile
 
 _NOTHING = 1e-100  # information of a column that moves nothing
@@ -97,9 +97,19 @@ class Discrepancy:
 
     def widened(self, posterior: Posterior, seed: int) -> Particles:
         """Draws of a posterior of theta, stretched and moved."""
-        drawn = posterior.sample((len(self.shift),), generator=torch.Generator().manual_seed(seed)).numpy()
-        middle = drawn.mean(0)
-        return Particles(np.clip(middle + self.stretch * (drawn - middle) + self.shift, 0, 1), posterior.space)
+        normal = isinstance(posterior, GaussianMixture)
+        wider = self._before_the_cube(posterior) if isinstance(posterior, GaussianMixture) else posterior
+        drawn = wider.sample((len(self.shift),), generator=torch.Generator().manual_seed(seed)).numpy()
+        if not normal:
+            middle = posterior.mean.numpy()
+            drawn = middle + self.stretch * (drawn - middle)
+        return Particles(np.clip(drawn + self.shift, 0, 1), posterior.space)
+
+    def _before_the_cube(self, posterior: GaussianMixture) -> GaussianMixture:
+        """Stretched where the cube does not cut it off yet, each component as probable as before."""
+        covariances = posterior.covariances.numpy() * np.outer(self.stretch, self.stretch)
+        log_weights = posterior.log_weights + posterior.log_masses
+        return GaussianMixture(log_weights, posterior.means, covariances, posterior.space).of_masses()
 
 
 def library_discrepancy(logs: ProbedLogs, seed: int = 0, options: DiscrepancyOptions = _OPTIONS) -> Discrepancy | None:

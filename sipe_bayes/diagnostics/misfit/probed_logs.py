@@ -6,9 +6,10 @@ the intervals for a model that lacks something (``misfit.missing_physics``) are 
 
 What a model lacks is a smooth force, and what it leaves of the samples, whitened by the noise of the fit, remembers
 itself: a hundred such samples tell as much as two of their own. With their integrated autocorrelation time as a factor
-on the variance of the noise (``ProbedLogs.discounted``) scores have the variance that they show, as in the adjustment
-of a composite likelihood (R. Chandler, S. Bate, "Inference for clustered data using the independence loglikelihood",
-Biometrika 94 (2007), 167-183, https://doi.org/10.1093/biomet/asm015); a factor for each channel instead of a matrix.
+on the variance of the noise (``ProbedLogs.discounted``) scores at low frequencies have the variance that they show, as
+in the adjustment of a composite likelihood (R. Chandler, S. Bate, "Inference for clustered data using the independence
+loglikelihood", Biometrika 94 (2007), 167-183, https://doi.org/10.1093/biomet/asm015); a factor for each channel instead
+of a matrix.
 """
 
 from __future__ import annotations
@@ -180,7 +181,7 @@ class ProbedLogs:
         out = copy.copy(self)
         for name in ("arrow", "seen", "memory"):
             out.__dict__.pop(name, None)
-        out.noise = remembering(self.noise, self.memory)
+        out.noise, out._nulls = remembering(self.noise, self.memory), {}
         return out
 
     def null(self, seed: int, simulated: int) -> FloatArray:

@@ -103,6 +103,7 @@ def declare(spec: mujoco.MjSpec, kind: str, name: str, law: Law) -> None:
         spec.add_sensor(name=label, type=sensor, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=label)
     if law.memory:
         memory = spec.add_actuator(name=label, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
+        _plain(memory)
         memory.dyntype, memory.actdim = mujoco.mjtDyn.mjDYN_USER, law.memory
         memory.gainprm = np.zeros(len(memory.gainprm))
         declare_start(spec, f"actuator:{label}", [_MEMORY_SD] * law.memory)
@@ -114,8 +115,20 @@ def _help(spec: mujoco.MjSpec, name: str, label: str) -> None:
     if own is None or int(own.trntype) == _BY_JOINT:
         return
     helper = spec.add_actuator(name=label, trntype=own.trntype, target=own.target)
+    _plain(helper)
     helper.refsite, helper.slidersite, helper.cranklength = own.refsite, own.slidersite, own.cranklength
     helper.gear = own.gear
+
+
+def _plain(actuator: mujoco.MjsActuator) -> None:
+    """Without what a model's defaults give to its actuators: a force of its command, of any size, at once."""
+    actuator.set_to_motor()
+    for numbers in (actuator.biasprm, actuator.dynprm, actuator.damping):
+        numbers[:] = 0.0
+    actuator.gainprm = np.eye(1, len(actuator.gainprm))[0]
+    actuator.delay, actuator.nsample, actuator.armature = 0.0, 0, 0.0
+    free = int(mujoco.mjtLimited.mjLIMITED_FALSE)
+    actuator.ctrllimited = actuator.forcelimited = actuator.actlimited = free
 
 
 @dataclass(frozen=True)
@@ -141,6 +154,12 @@ class LawNumbers:
         for attribute, value in self.values:
             data[LAW_OF[kind, attribute][1]] = value
         numeric.data = data
+
+
+def is_of_law(actuator: str) -> bool:
+    """Whether an actuator is a law's own, as a model that was written with laws has them; nothing commands it."""
+    head, _, name = actuator.rpartition(".")
+    return ":" in head and name in LAWS
 
 
 def laws_of(model: mujoco.MjModel) -> tuple[BoundLaw, ...]:

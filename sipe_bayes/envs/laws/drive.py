@@ -59,7 +59,10 @@ class Power(Law):
     """An actuator whose force goes with a power of the model's, as a propeller's with the square of its speed."""
 
     name, kind, senses, friction = "power", "actuator", "force", False
-    numbers = (Number("exponent", "1", 1.0, minimum=0.1), Number("exponent_force", "force", 1.0, shape=True))
+    numbers = (
+        Number("exponent", "1", 1.0, minimum=0.1),
+        Number("exponent_force", "force", 1.0, minimum=1e-12, shape=True),
+    )
 
     def value(self, now: Now) -> FloatArray:
         """The force f (|f / F|^(n - 1) - 1)."""

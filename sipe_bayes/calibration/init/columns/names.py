@@ -153,7 +153,7 @@ def read_name(column: str, own: Collection[str] = ()) -> Label:
         unit, words = _UNITS[last.lower()], words[:-parts]
     if not unit and len(words) > 1:
         for length in (3, 2, 1):  # rad_per_s, rad_s, rad
-            if len(words) > length and not {*words[-length:]} <= {*own} and (word := _unit_of(words[-length:])):
+            if len(words) > length and not _called(words, length, own) and (word := _unit_of(words[-length:])):
                 unit, words = word, words[:-length]
                 break
     if len(words) == 1 and words[0] in ("us", "ms", "ns"):
@@ -174,6 +174,11 @@ def read_name(column: str, own: Collection[str] = ()) -> Label:
     vector = _without_axis(column, words[-1]) if axis else ""
     says = bool(flags & {"measured"}), bool(flags & {"command", "desired"})
     return Label(column, kind, tuple(rest), number, stem, unit, angular, axis, vector, *says)
+
+
+def _called(words: list[str], length: int, own: Collection[str]) -> bool:
+    """Whether the last words are what a joint is called, and not a unit behind that: position_A1, A1_current_A."""
+    return {*words[-length:]} <= {*own} and words.count(words[-1]) == 1
 
 
 def pieces_of(name: str) -> list[str]:

@@ -57,3 +57,8 @@ def test_names_that_are_spelt_shorter_are_alike() -> None:
     assert alike(("elb",), "elbow") > 0.6
     assert alike(("wrist",), "elbow") == 0.0
     assert alike(("shoulder", "pan"), "shoulder_pan") > alike(("shoulder", "lift"), "shoulder_pan")
+
+
+def test_a_unit_behind_what_a_joint_is_called() -> None:
+    assert read_name("A1_current_A", {"a"}).unit == "A"
+    assert read_name("position_A1", {"a"}).unit == ""
