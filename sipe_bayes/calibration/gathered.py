@@ -33,6 +33,7 @@ _FREE = 0  # mjJNT_FREE
 _DRAWS = 4000  # of the posterior: quantiles to one or two percent of an sd
 _CUT = 2e-3  # of the range, within which an interval ends at a bound
 _DIFFERENT, _APART = 0.1, 3.0  # of the mean of the logs, and sds of a difference
+_NO_BODY = 0.01  # of the posterior, from which it is told
 _NAMED = 3  # logs of what is summed up
 
 
@@ -235,6 +236,18 @@ def uneven_targets(environment: MjcfEnvironment) -> list[Finding]:
         for p in environment.space
         if environment.uneven(p)
     ]
+
+
+def no_rigid_bodies(simulator: Simulator, posterior: Posterior, seed: int) -> list[Finding]:
+    """Where moments of inertia are unknown: a posterior of which a part is no body's, and is never simulated."""
+    environment = simulator.environment
+    own = [p.name for p in environment.space if any(".inertia_" in target for target in p.targets)]
+    if not own:
+        return []
+    drawn = posterior.sample((_DRAWS,), generator=torch.Generator().manual_seed(seed)).numpy()
+    model = environment.compile()
+    share = float(np.mean([not environment.write(model, values) for values in environment.space.values(drawn)]))
+    return [finding(Code.NO_RIGID_BODY, parameters=own, share=100 * share)] if share > _NO_BODY else []
 
 
 def not_better(scores: Sequence[ChannelScore]) -> list[Finding]:

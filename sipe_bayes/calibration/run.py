@@ -15,7 +15,14 @@ from sipe_bayes.calibration.checks.lacking import lacking
 from sipe_bayes.calibration.checks.plan import Checks, Plan, plan_of, rollouts_of, with_checks
 from sipe_bayes.calibration.checks.predictions import Predictions, every_channel, place_in_prior
 from sipe_bayes.calibration.checks.ranges import ranges_that_change_nothing
-from sipe_bayes.calibration.gathered import Marginals, most_probable, of_logs, uneven_targets, unmeasured_starts
+from sipe_bayes.calibration.gathered import (
+    Marginals,
+    most_probable,
+    no_rigid_bodies,
+    of_logs,
+    uneven_targets,
+    unmeasured_starts,
+)
 from sipe_bayes.calibration.output import (
     CHECKPOINT,
     CHECKS,
@@ -84,7 +91,7 @@ def calibrate(
         *(look.finding for look in (*outside.logs, misfit) if look is not None and look.alarm),
         *problem.findings,
         *unmeasured_starts(problem.simulator, logs, problem.likelihood, problem.holdout is not None),
-        *_own(method, misfit is not None),
+        *_own(problem, method, posterior, misfit is not None),
         *(finding(Code.AGREEMENT_UNKNOWN, log=name) for name in alone.skipped),
         *lacks.findings,
         *(() if Findings(lacks.findings).of(Code.NOISE_FREE) else drifting(fit.channel_noise())),
@@ -146,14 +153,15 @@ def _mixing(method: Estimator) -> Mixing | None:
     return Mixing.of(measured, method.space.names) if measured else None
 
 
-def _own(method: Estimator, asked: bool) -> list[Finding]:
-    """What the estimator noticed itself; bounds are told by parameter, with their values.
+def _own(problem: Problem, method: Estimator, posterior: Posterior, asked: bool) -> list[Finding]:
+    """What the estimator noticed itself, and what its edge may be; bounds are told by parameter, with their values.
 
     asked: whether what the model lacks is asked for, so that nothing else need say that a channel is not followed.
     """
     elsewhere = {Code.AT_BOUND, Code.NOISE_EXCEEDS_SCATTER} if asked else {Code.AT_BOUND}
     spread = [] if method.uncertain else [finding(Code.SEARCH_SPREAD, method=method.name)]
-    return [item for item in method.findings if item.code not in elsewhere] + spread
+    noticed = [item for item in method.findings if item.code not in elsewhere]
+    return noticed + spread + no_rigid_bodies(problem.simulator, posterior, method.seed)
 
 
 def _left_out(problem: Problem, method: Estimator) -> list[Finding]:

@@ -146,6 +146,10 @@ ADVICE: dict[Code, str] = {
         "The interval would reach further, so that it may miss a value behind the bound. Widen the bounds, unless "
         "nature sets them, and calibrate again."
     ),
+    Code.NO_RIGID_BODY: (
+        "Nothing is simulated there, and the edge looks as if they were rough. Raise the body's other moments in "
+        "the model (of what turns about one axis they do nothing), or narrow the bounds."
+    ),
     Code.MEAN_OF_LOGS: (
         "No log had the mean. Where the difference is known, as of a weighed load, say it in the log: `added = "
         '{"body:NAME.mass" = 3.0}`, in held-out logs too; else put the value that you want into the MJCF.'

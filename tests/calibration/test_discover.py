@@ -285,7 +285,7 @@ def test_a_budget_that_ends_too_soon_is_said_and_what_to_give(tmp_path: Path) ->
     assert any(
         text.startswith(f"No value may be trusted yet: the budget of 60 rollouts {open_still}") for text in texts
     )
-    assert "of what was fitted" in texts[0]
+    assert "no piece was fitted to its end" in texts[0]
     assert json.loads((tmp_path / "out" / "structures.json").read_text())["settled"] is False
     assert before in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     onward = run_discovery(config, tmp_path / "out", budget=3000, num_threads=1)

@@ -7,10 +7,12 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from sipe_bayes.calibration.gathered import Marginals
+from sipe_bayes.calibration.gathered import Marginals, no_rigid_bodies
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.posterior import GaussianMixture, Particles, prior
+from sipe_bayes.simulation.simulator import Simulator
 
 
 def marginals(space: ParameterSpace, mean: list[float], natural: frozenset[str] = frozenset()) -> Marginals:
@@ -46,3 +48,20 @@ def test_the_mean_of_logs_that_no_log_had(second: float, told: bool, target: str
     told &= not target.startswith("sensor:")
     assert [one.code for one in noticed] == [Code.MEAN_OF_LOGS] * told
     assert all("mass differs" in one.text and "the mean, 5 kg" in one.text for one in noticed)
+
+
+RAFT = """<mujoco><worldbody><body name="hull"><joint name="yaw" axis="0 0 1"/>
+  <inertial pos="0 0 0" mass="9" diaginertia="{across} {across} .2"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("across", "middle", "share"), [(0.1, 0.2, 50), (0.1, 0.35, 100), (0.1, 0.1, 0), (2.0, 0.35, 0)]
+)
+def test_a_posterior_that_no_rigid_body_can_have_is_told(across: float, middle: float, share: int) -> None:
+    """Of moments .1, .1 and .2 the last is as large as it can be, about an axis that alone matters."""
+    moment = Parameter("moment", 0.0, 1.0, targets=("body:hull.inertia_zz",))
+    environment = MjcfEnvironment.build(RAFT.format(across=across), [moment], [], ["joint:yaw.position"])
+    normal = GaussianMixture([0.0], np.array([[middle]]), np.array([[[0.02**2]]]), environment.space)
+    noticed = no_rigid_bodies(Simulator(environment, 1), normal, 0)
+    assert [one.code for one in noticed] == [Code.NO_RIGID_BODY] * (share > 0)
+    assert all(abs(float(one.text.split("in ")[1].split(" %")[0]) - share) <= 3 for one in noticed)

@@ -96,7 +96,7 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
         "fair",
         "Use values within the intervals",
     ),
-    "nothing tried": (changed(**left(LARGE), settled=False, findings=(CUT,)), "bad", "no piece was tried"),
+    "nothing tried": (changed(**left(LARGE), settled=False, findings=(CUT,)), "bad", "no piece was fitted to its end"),
 }
 
 

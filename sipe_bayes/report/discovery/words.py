@@ -88,7 +88,9 @@ def headline(discovery: Discovery) -> Verdict:
     if discovery.passes:
         return Verdict("good", "Nothing is lacking that these logs would show.")
     if not discovery.pieces and cut_short(discovery):
-        return Verdict("bad", "The residuals are not noise; no piece was tried, so what the model lacks is not known.")
+        return Verdict(
+            "bad", "The residuals are not noise; no piece was fitted to its end, so what the model lacks is not known."
+        )
     if cut_short(discovery):
         return Verdict("bad", "The residuals are not noise; of what was fitted nothing is shown to be lacking yet.")
     tried = "no piece that was tried is shown to be" if alternatives(discovery) else "nothing that was tried is"
