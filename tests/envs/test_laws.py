@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from sipe_bayes.calibration.init.machine import Machine
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.laws.base import Law, LawError
 from sipe_bayes.envs.laws.bound import declare, laws_of
@@ -249,6 +250,7 @@ def test_a_thruster_at_a_site_has_laws_too(
     measured = ["joint:x.position", "joint:turn.position"]
     xml = THRUSTER.replace("<worldbody>", f"<default>{DEFAULTS[default]}</default><worldbody>")
     simulator = Simulator(MjcfEnvironment.build(xml.format(gear=2), [law, unknown], ["jet"], measured), 1)
+    assert [actuator.name for actuator in Machine.of(simulator.model).actuators] == ["jet"]  # of which init asks
     commands = np.random.default_rng(0).uniform(-1, 1, (1, 20, 1))
     theta = simulator.space.normalise(np.array([[value, gear]]))
     run = simulator.rollout(theta, commands, simulator.default_state()[None], 0.01)

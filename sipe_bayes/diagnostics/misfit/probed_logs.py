@@ -5,7 +5,7 @@ The columns of the linear model are the N parameters, K probes (a small step of 
 the intervals for a model that lacks something (``misfit.missing_physics``) are both answered in it.
 
 What a model lacks is a smooth force, and what it leaves of the samples, whitened by the noise of the fit, remembers
-itself: a hundred such samples tell as much as two of their own. With their integrated autocorrelation time as a factor
+itself: many such samples tell as much as one of its own would. With their integrated autocorrelation time as a factor
 on the variance of the noise (``ProbedLogs.discounted``) scores at low frequencies have the variance that they show, as
 in the adjustment of a composite likelihood (R. Chandler, S. Bate, "Inference for clustered data using the independence
 loglikelihood", Biometrika 94 (2007), 167-183, https://doi.org/10.1093/biomet/asm015); a factor for each channel instead
