@@ -8,7 +8,8 @@ Machines: a pendulum with a motor, a double pendulum with a motor at each joint,
 mass and damping of each body unknown, positions measured (5 s, 100 Hz) with noise of half a percent of their
 root-mean-square, white or AR(1) with rho 0.9; commands are sums of sines. Planted is one extension of the library at
 one joint, in three sizes: what its force (or what it does to the command) is of the joint's usual force, 5, 10 and 20
-%; delays of 1, 2 and 4 samples. A slide has no cogging. The null is the right model.
+%; delays and lags of 1, 2 and 4 samples, powers of 1.1, 1.2 and 1.4. A slide has no cogging. The null is the right
+model.
 
 A cause is named where the structures that hold it have together a probability of at least 5 %, as in the report:
 several that explain a log about as well are all named (a slide's motor with a zero error moves as one on a tilted
@@ -89,6 +90,12 @@ EFFECTS = (
     "force_limit",
     "force_drop",
     "cogging",
+    "lag",
+    "dead_zone",
+    "power",
+    "direction_gain",
+    "hysteresis",
+    "cubic_damping",
 )
 
 
@@ -136,6 +143,12 @@ def values(placed: Placed, machine: Machine, size: float) -> list[float]:
         "force_limit": [machine.forces.get(site, 1.0) * {0.05: 1.7, 0.1: 1.5, 0.2: 1.2, 0.4: 1.0}[size]],
         "force_drop": [size / machine.forces.get(site, 1.0)],
         "cogging": [force, 0.0, 7.0],
+        "lag": [DT * {0.05: 1, 0.1: 2, 0.2: 4, 0.4: 8}[size]],
+        "dead_zone": [size * machine.forces.get(site, 1.0)],
+        "power": [1 + 2 * size, machine.forces.get(site, 1.0)],
+        "direction_gain": [size],
+        "hysteresis": [force, 0.3 * own.position],
+        "cubic_damping": [force / own.velocity**3],
     }[name]
 
 

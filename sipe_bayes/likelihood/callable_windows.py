@@ -55,7 +55,7 @@ class CallableWindows(Windows):
         """Zero (N,): fn is smooth as far as is known."""
         return np.zeros(self.num_theta)
 
-    def states(self, starts: FloatArray) -> FloatArray:
+    def states(self, theta: FloatArray, starts: FloatArray) -> FloatArray:
         """The starts (..., W, 0) themselves."""
         return starts
 

@@ -36,13 +36,14 @@ from sipe_bayes.likelihood.starts.estimates import (
     estimate_states,
     start_sd,
 )
+from sipe_bayes.likelihood.starts.filters import FilterStarts
 from sipe_bayes.likelihood.starts.history import past_commands, with_history
 from sipe_bayes.simulation.contacts import Contacts
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import moved
 
 _BY_SAMPLE = ("owned", "compared", "measured", "observed")  # what a part of the windows has a part of
-_BY_WINDOW = ("log", "start", "stride", "lead", "begin", "steps", "dt", "actions", "reference", *_BY_SAMPLE)
+_BY_WINDOW = ("number", "log", "start", "stride", "lead", "begin", "steps", "dt", "actions", "reference", *_BY_SAMPLE)
 
 
 @dataclass(frozen=True)
@@ -140,6 +141,8 @@ class Windows:
         past = past_commands(simulator, trajectories, self.log, self.start, self.dt)
         recorded = are_states(simulator, trajectories.states)
         self.reference = with_history(simulator, reference, past, self.dt, self.start, recorded)
+        self.number, age = np.arange(len(self.log)), self.start * self.dt
+        self.filters = FilterStarts(simulator, self.reference, past, age, self.dt, self.names, recorded)
         free = start_sd(simulator, trajectories) if self.settings.starts == "estimated" else np.zeros(0)
         self.num_start, self.start_precision = len(free), free**-2.0
 
@@ -255,11 +258,11 @@ class Windows:
         """The starts (W, D) at their reference."""
         return np.zeros((self.num_windows, self.num_start))
 
-    def states(self, starts: FloatArray) -> FloatArray:
-        """Starting states (..., W, S) of starts (..., W, D)."""
+    def states(self, theta: FloatArray, starts: FloatArray) -> FloatArray:
+        """Starting states (B, W, S) of starts (B, W, D) under theta (B, N)."""
         if not self.num_start:
             return np.broadcast_to(self.reference, (*starts.shape[:-1], self.reference.shape[-1])).copy()
-        return moved(self.simulator.model, self.reference, starts)
+        return self.filters.put(moved(self.simulator.model, self.reference, starts), theta, starts, self.number)
 
     def predict(self, theta: FloatArray, starts: FloatArray, in_float64: bool = False) -> tuple[FloatArray, BoolArray]:
         """Simulate every window.
@@ -279,7 +282,7 @@ class Windows:
         batch = len(theta)
         self.spend(batch)
         thetas = np.repeat(theta, self.num_windows, axis=0)
-        states = self.states(starts).reshape(batch * self.num_windows, -1)
+        states = self.states(theta, starts).reshape(batch * self.num_windows, -1)
         actions = np.tile(self.actions, (batch, 1, 1))
         goals = None if self.goals is None else np.tile(self.goals, (batch, 1))
         dt, names = np.tile(self.dt, batch), self.names * batch

@@ -31,13 +31,14 @@ def carried_starts(before: mujoco.MjModel, windows: Windows, theta: FloatArray, 
         starts: (B, W, D), which tell the other states.
     """
     after, count = windows.simulator.model, windows.num_windows
-    own = np.setdiff1d(np.arange(starts.shape[-1]), _places(before, after))
+    known = np.concatenate([_places(before, after), windows.filters.numbers])
+    own = np.setdiff1d(np.arange(starts.shape[-1]), known)
     follows = _follows(windows)
     if not len(own) or not follows.any():
         return starts
     windows.spend(len(theta))
     thetas, actions = np.repeat(theta, count, axis=0), np.tile(windows.actions, (len(theta), 1, 1))
-    states = windows.states(starts).reshape(len(thetas), -1)
+    states = windows.states(theta, starts).reshape(len(thetas), -1)
     dt, names = np.tile(windows.dt, len(theta)), windows.names * len(theta)
     run = windows.simulator.rollout(thetas, actions, states, dt, names)
     assert run.states is not None

@@ -243,7 +243,8 @@ def _motion(
     simulator: Simulator, windows: Windows, theta: FloatArray, starts: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """States (n, S) and controls (n, U) spread over the windows."""
-    run = simulator.rollout(theta[None], windows.actions, windows.states(starts), windows.dt, windows.names)
+    begin = windows.states(theta[None], starts[None])[0]
+    run = simulator.rollout(theta[None], windows.actions, begin, windows.dt, windows.names)
     assert run.states is not None
     states = run.states[:, :-1].reshape(-1, run.states.shape[-1])
     controls = simulator.environment.control(simulator.model, states, windows.actions.reshape(len(states), -1))

@@ -1,6 +1,7 @@
 r"""Two scores of a fitted structure: its evidence, and how well it foretells pieces of the logs that it has not seen.
 
-Both come from one linearisation at the optimum, with the same coloured noise and the windows' starts marginalised. With
+Both come from one linearisation at the optimum, with the same coloured noise and the windows' starts marginalised, of
+windows that are compared from the same samples on in all structures, as late as the latest sensor asks. With
 H the information of theta (starts eliminated) plus the prior's, m the normal's mean and the cube as the prior's
 support,
 
@@ -22,6 +23,7 @@ Deviations:
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +32,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.likelihood.noise import Noise, coefficients
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.restricted import eliminate_starts
+from sipe_bayes.likelihood.sequences import reached
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior.truncated_normal import TruncatedNormal
 
@@ -62,7 +65,9 @@ def scores(windows: Windows, theta: FloatArray, starts: FloatArray, noise: Noise
     Raises:
         ValueError: where the simulation diverges.
     """
+    own, windows = windows, _led(windows)
     linearisation = windows.linearise(theta, starts)
+    own.rollouts += windows.rollouts if windows is not own else 0
     if not linearisation.valid:
         raise ValueError("theta: the simulation diverges at the optimum")
     # one block for each window also where starts are known
@@ -78,6 +83,20 @@ def scores(windows: Windows, theta: FloatArray, starts: FloatArray, noise: Noise
         for piece in pieces
     ]
     return Scores(whole, float(sum(whole - other for other in without)))
+
+
+def _led(windows: Windows) -> Windows:
+    """The windows, simulated on and compared as those of the latest model that they are compared with.
+
+    Where a model has a late sensor, windows are compared from later on. Their starts are then less well known, and cost
+    less: nats that a model without would pay for nothing that it lacks.
+    """
+    late = np.array([dict(windows.settings.late).get(name, 0.0) for name in windows.fitted])
+    if not late.any():
+        return windows
+    latest, like = np.maximum(late, windows.simulator.environment.remembers[windows.channels]), copy.copy(windows)
+    like.lead, like.begin, _ = reached(latest, latest, windows.dt, windows.log, windows.start, windows.stride)
+    return Windows(windows.settings, windows.simulator, windows.trajectories, like)
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ def test_residuals_are_rotations_from_predicted_to_measured(windows: Windows) ->
     theta, starts = np.array([[0.3]]), windows.no_starts()[None]
     residual, valid = windows.residuals(theta, starts)
     assert valid.all()
-    motion = windows.simulator.rollout(theta, windows.actions, windows.states(starts)[0], windows.dt)
+    motion = windows.simulator.rollout(theta, windows.actions, windows.states(theta, starts)[0], windows.dt)
     for w in range(2):
         measured = windows.measured[w]
         np.testing.assert_allclose(residual[0, w, :, :3], measured[:, :3] - motion.observations[w, :, :3], atol=1e-12)
@@ -87,7 +87,7 @@ def test_the_jacobian_is_that_of_the_residual(windows: Windows, offset: float) -
         for step in (-STATE_STEP, STATE_STEP):
             moved = starts.copy()
             moved[:, d] += step
-            state = turned.states(moved[None])[0]
+            state = turned.states(theta[None], moved[None])[0]
             ends.append(turned.simulator.rollout(theta[None], turned.actions, state, turned.dt).observations)
         for w in range(2):
             measured = turned.measured[w][:12][:, TURN]  # before anything touches the floor

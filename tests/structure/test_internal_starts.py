@@ -27,7 +27,7 @@ def larger(name: str) -> tuple[Windows, Placed, Windows]:
     return plain, placed, Windows(Segments(window=0.4), simulator, LOGS)
 
 
-OWN = {"lag": [3], "hysteresis": [3, 4, 5], "base_compliance": [1, 2, 4, 5]}  # columns of the physics state
+OWN = {"hysteresis": [3, 4, 5], "base_compliance": [1, 2, 4, 5]}  # columns of the physics state
 
 
 @pytest.mark.parametrize(("name", "columns"), OWN.items())
@@ -36,7 +36,7 @@ def test_a_window_begins_where_the_one_before_it_ends(name: str, columns: list[i
     theta = np.concatenate([THETA, np.full(len(placed.parameters), 0.4)])
     starts = mapped_starts(plain.simulator.model, windows.simulator.model, np.full((6, 2), 0.01))
     begun = carried_starts(plain.simulator.model, windows, theta[None], starts[None])[0]
-    at_rest, states = windows.states(starts), windows.states(begun)
+    at_rest, states = windows.states(theta[None], starts[None])[0], windows.states(theta[None], begun[None])[0]
     run = windows.simulator.rollout(theta, windows.actions, at_rest, windows.dt, windows.names)
     assert run.states is not None
     for window in range(6):

@@ -168,3 +168,22 @@ def test_a_load_that_one_log_has_is_named() -> None:
     values = np.asarray(structures.posterior_of(structures.best).values(1000))[:, 1:]
     print(values.mean(0), values.std(0))
     assert (np.abs(values.mean(0) - [*loaded.values()]) < 4 * values.std(0)).all()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(
+    ("label", "target", "edits"),
+    [
+        ("lag:motor", "actuator:motor.lag", (FilteredCommand(("motor",), 0.6),)),
+        ("sensor_filter:joint:hinge.position", "sensor:joint:hinge.position.filter", ()),
+    ],
+)
+def test_a_lag_of_the_command_is_told_from_one_of_the_sensor(
+    label: str, target: str, edits: tuple[Edit, ...], seed: int
+) -> None:
+    """Neither pays for its windows' starts what the other does not."""
+    machine = pendulum(Parameter("own", 0.0, 0.2, targets=(target,)), edits=edits)
+    recorded = Trajectories.stack([log(machine, [0.6, 0.08, 0.05], seed)])
+    structures = discover(pendulum(), recorded, restriction=Restriction(only=("lag", "sensor_filter")))
+    print(structures.table())
+    assert structures.best.labels == (label,)

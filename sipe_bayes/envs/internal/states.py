@@ -72,18 +72,23 @@ def filtered_commands(model: mujoco.MjModel) -> list[tuple[int, int]]:
     return [(k, 1 + model.nq + model.nv + int(model.actuator_actadr[k])) for k in filters]
 
 
+def kept_by_filter(model: mujoco.MjModel, actuator: int, timestep: float) -> float:
+    """The share of where an actuator's filter was that is left a timestep (s) later, as MuJoCo integrates it."""
+    tau = float(model.actuator_dynprm[actuator, 0])
+    if int(model.actuator_dyntype[actuator]) == int(mujoco.mjtDyn.mjDYN_FILTER):
+        return max(0.0, 1 - timestep / max(tau, mujoco.mjMINVAL))
+    return float(np.exp(-timestep / tau)) if tau > 0 else 0.0
+
+
 def filtered_command(model: mujoco.MjModel, actuator: int, past: FloatArray, timestep: float) -> float:
     """Where an actuator's filter is after commands (P,), one a timestep (s), the first of them held for long before."""
-    control, tau = int(model.actuator_ctrladr[actuator]), float(model.actuator_dynprm[actuator, 0])
+    control, kept = int(model.actuator_ctrladr[actuator]), kept_by_filter(model, actuator, timestep)
     late = round(float(model.actuator_delay[actuator]) / timestep)
     past = past[: max(1, len(past) - late)]
     if model.actuator_ctrllimited[control]:
         past = np.clip(past, *model.actuator_ctrlrange[control])
-    weights = np.zeros(len(past))
-    weights[-1] = 1.0
-    if tau > 0:
-        weights = np.exp(-np.arange(len(past))[::-1] * timestep / tau)
-        weights[0] /= -np.expm1(-timestep / tau)
+    weights = kept ** np.arange(len(past))[::-1]
+    weights[0] /= 1 - kept
     value = float(weights @ past / weights.sum())
     limited = bool(model.actuator_actlimited[actuator])
     return float(np.clip(value, *model.actuator_actrange[actuator])) if limited else value

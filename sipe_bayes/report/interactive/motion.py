@@ -34,7 +34,8 @@ def motion(
     starts = measured_starts(windows, np.stack(list(theta.values())))
     simulated = {}
     for name, one, start in zip(theta, theta.values(), starts, strict=True):
-        result = simulator.rollout(one[None], windows.actions, windows.states(start), windows.dt, windows.names)
+        begin = windows.states(one[None], start[None])[0]
+        result = simulator.rollout(one[None], windows.actions, begin, windows.dt, windows.names)
         own = windows.owned
         simulated[name] = (_stitched(result.states, own), _stitched(result.observations, own)[:, channel])
     return Motion(

@@ -71,7 +71,7 @@ def test_first_moments_tell_where_windows_start(windows: Windows) -> None:
     samples = int(TUNING.telling / windows.dt[0]) + 2
     slope = np.sqrt(12) * NOISE / (samples**1.5 * windows.dt[0])
     error = {
-        name: np.sqrt(((windows.states(starts) - states[:, 0])[:, velocity] ** 2).mean())
+        name: np.sqrt(((windows.states(TRUTH[None], starts[None])[0] - states[:, 0])[:, velocity] ** 2).mean())
         for name, starts in (("told", told), ("measured", windows.no_starts()))
     }
     assert error["told"] < 1.3 * slope < 0.5 * error["measured"], (error, slope)

@@ -127,7 +127,7 @@ def test_windows_begin_where_a_late_sensor_will_say() -> None:
     both = Windows(Segments(), simulator, Trajectories.stack([half, log]))
     windows, off = both.part(np.flatnonzero(both.log == 1)), []
     for one in (theta, np.append(theta[:-1], 0.0)):
-        begin = windows.states(measured_starts(windows, one[None]))[0, :-1]
+        begin = windows.states(one[None], measured_starts(windows, one[None]))[0, :-1]
         off.append(np.abs(begin[:, 1:3] - truth[windows.start[:-1]]).max(0))
     print(off)
     assert off[0][1] < 0.05 * off[1][1]

@@ -60,6 +60,7 @@ def led_on(problem: SearchProblem, windows: Windows, state: WindowState) -> Wind
         return tried
     begins = np.stack([trail.states[k][s] for k, s in zip(windows.log, windows.start, strict=True)])
     starts = tangents(windows.simulator.model, begins, windows.reference)
+    starts[:, windows.filters.numbers] = 0.0  # theta and the commands tell
     residual, valid = windows.residuals(trail.theta[None], starts[None])
     left = np.sqrt((residual[0] ** 2).sum((0, 1)) / np.maximum(windows.observed.sum((0, 1)), 1))
     if not valid[0] or not np.log(left / best.sd).mean() < np.log(tuning.better):
@@ -94,7 +95,10 @@ def trailed(
     if not optima:
         return None, spent
     best = max(optima, key=lambda one: one.evidence)
-    thetas, begin = np.tile(best.theta, (windows.num_windows, 1)), windows.states(best.starts)
+    thetas, begin = (
+        np.tile(best.theta, (windows.num_windows, 1)),
+        windows.states(best.theta[None], best.starts[None])[0],
+    )
     rollout = simulator.rollout(thetas, windows.actions, begin, windows.dt, windows.names, goals=windows.goals)
     assert rollout.states is not None
     states = [np.full((len(one) + 1, begin.shape[1]), np.nan) for one in logs]
