@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,6 +33,8 @@ _LEAST_TURN, _MOST_TURNS = 0.01, 12.0
 _SHARES = (1.0, 100.0)  # that need not be whole numbers
 _FULL_DUTIES = (1.0, 100.0, 127.0, 255.0, 400.0, 511.0, 1000.0, 1023.0, 2047.0, 4095.0, 32767.0, 65535.0)
 _MILLIVOLTS = 200.0
+_PULSES = (800.0, 2200.0)  # us, the widths that servos and speed controllers take
+_SHARED = (Drive.FORCE, Drive.VOLTAGE, Drive.OTHER)  # what takes a share of all that there is
 _NOISE = 0.01  # of the largest command, what is about zero
 _FEW = 0.05  # of the samples, what tells nothing of the side on which a command lies
 _TURNS = {360.0: "deg", 2 * np.pi: "rad", 1.0: "rev"}
@@ -196,12 +199,13 @@ def _command(actuator: Actuator, match: Match, matches: Matches, table: Table) -
         Drive.VOLTAGE: {Kind.TORQUE: force, Kind.CURRENT: "A"}.get(match.label.kind, "V"),
         Drive.OTHER: "1",
     }[actuator.drive]
-    share = match.label.unit == "%" and actuator.drive in (Drive.FORCE, Drive.VOLTAGE, Drive.OTHER)
-    if share or match.label.kind == Kind.DUTY:
+    share = match.label.unit == "%" and actuator.drive in _SHARED
+    pulses = actuator.drive in _SHARED and _pulse(table[match.column], actuator, match.label.unit == "us")
+    if share or match.label.kind == Kind.DUTY or pulses:
         return _duty(match, actuator, table)
     named = match.label.unit
     fits = named in (unit_words(find_unit(default).dimension)) or (
-        actuator.drive in (Drive.FORCE, Drive.OTHER, Drive.VOLTAGE) and named not in ("", "rad", "deg", "m", "mm")
+        actuator.drive in _SHARED and named not in ("", "rad", "deg", "m", "mm")
     )
     reading = Reading(match, named if named and fits else default, notes=_matched(match))
     if named and not fits:
@@ -220,14 +224,23 @@ def _duty(match: Match, actuator: Actuator, table: Table) -> Reading:
     values = table[match.column]
     largest, whole = float(np.nanmax(np.abs(values))), bool((np.mod(values[np.isfinite(values)], 1) == 0).all())
     full = next((f for f in _FULL_DUTIES if largest <= 1.005 * f and (whole or f in _SHARES)), largest)
+    unit, factor, zero, size = (
+        "1",
+        1.0 if full == 1 else float(f"{1 / full:.6g}"),
+        0.0,
+        f"at most {largest:g} of {full:g}",
+    )
     if match.label.unit == "%" or full == _SHARES[1]:
         unit, factor = "%", 1.0
-    else:
-        unit, factor = "1", 1.0 if full == 1 else float(f"{1 / full:.6g}")
-    reading = Reading(match, unit, factor=factor, notes=(*_matched(match), f"a duty: at most {largest:g} of {full:g}"))
+    elif (pulse := _pulse(values, actuator, True)) and actuator.drive in _SHARED:
+        zero, factor, match = pulse.none, 1 / pulse.span, replace(match, label=replace(match.label, unit=""))
+        size = f"a pulse in us, nothing at {zero:g} and all at {zero + pulse.span:g}, as a speed controller takes it"
+    reading = Reading(match, unit, factor=factor, zero=zero, notes=(*_matched(match), f"a duty: {size}"))
     voltages = [name for name in table if read_name(name).kind == Kind.SUPPLY]
-    if voltages:
-        volts = "mV" if float(np.nanmedian(table[voltages[0]])) > _MILLIVOLTS else "V"
+    ends = np.inf if actuator.limits is None else max(actuator.limits)
+    supplied = [float(np.nanmedian(table[name])) for name in voltages]
+    if voltages and ends >= supplied[0] * (1e-3 if supplied[0] > _MILLIVOLTS else 1) / 2:
+        volts = "mV" if supplied[0] > _MILLIVOLTS else "V"
         note = f"what arrives is it times {voltages[0]!r}"
         return replace(reading, supply=(voltages[0], volts), notes=(*reading.notes, note))
     if actuator.full is not None:
@@ -240,11 +253,32 @@ def _duty(match: Match, actuator: Actuator, table: Table) -> Reading:
     return replace(reading, doubts=(doubt,), instead=(f"factor = {12 * factor:.6g}  # at 12 V",))
 
 
+class _Pulse(NamedTuple):
+    """Of a pulse's width in microseconds: where nothing is driven, and how much more drives fully."""
+
+    none: float
+    span: float
+
+
+def _pulse(values: FloatArray, actuator: Actuator, named: bool) -> _Pulse | None:
+    """How a command is read as pulses of a servo's or a speed controller's kind; None where it is none.
+
+    One without a name that says so is, where its actuator's ctrlrange ends far below.
+    """
+    values = values[np.isfinite(values) & (values != 0)]  # 0: not armed
+    if not len(values) or values.min() < _PULSES[0] or values.max() > _PULSES[1]:
+        return None
+    if not named and (actuator.limits is None or max(actuator.limits) > _SHARES[1]):
+        return None
+    both_ways = actuator.limits[0] < 0 if actuator.limits else not actuator.flies and values.min() < 1400
+    return _Pulse(1500.0, 500.0) if both_ways else _Pulse(1000.0, 1000.0)
+
+
 def _on_its_side(reading: Reading, actuator: Actuator, table: Table) -> Reading:
     """A command with the sign that the actuator's ctrlrange leaves it, where that lies on one side of zero."""
     if actuator.limits is None or not actuator.one_way:
         return reading
-    values = table[reading.match.column] * reading.factor * find_unit(reading.unit).factor
+    values = (table[reading.match.column] - reading.zero) * reading.factor * find_unit(reading.unit).factor
     values = values[np.isfinite(values)] * (1 if max(actuator.limits) > 0 else -1)
     least, most = np.sort(np.abs(actuator.limits))
     lost = float((values < -_NOISE * np.abs(values).max()).mean())

@@ -85,7 +85,8 @@ _TORQUES |= {"drehmoment", "kraft"}
 _COMMANDS = {"cmd", "command", "commands", "commanded", "u", "ctrl", "control", "controls", "action", "actions"} | {
     "input", "drive", "applied", "a",
 }  # fmt: skip
-_DUTIES = {"pwm", "duty", "dutycycle", "throttle"}
+_DUTIES = {"pwm", "duty", "dutycycle", "throttle", "rcou", "pulse", "pulsewidth", "esc"}
+_PULSED = {"motor", "rotor", "servo", "prop", "thruster"}  # in microseconds
 _SUPPLIES = {"battery", "batt", "vbat", "vbatt", "supply", "vbus", "vdc", "vcc", "vin"}
 _DESIRED = {"des", "desired", "ref", "reference", "setpoint", "sp", "set", "target", "goal", "demand", "wanted"} | {
     "requested", "dem", "soll", "sollwert",
@@ -241,7 +242,8 @@ def _kind(flags: set[str], unit: str, words: list[str]) -> Kind:
         return Kind.OTHER
     if "supply" in flags and not place and not flags & {"current", "torque", "other"} and unit not in ("A", "mA", "%"):
         return Kind.SUPPLY
-    if "duty" in flags and not place:
+    of_another = place or flags & {"speed", "current", "voltage", "other"}
+    if ("duty" in flags and not of_another) or (unit == "us" and _PULSED & {*words}):
         return Kind.DUTY
     if drive is not None:
         return drive
@@ -262,14 +264,7 @@ def _kind(flags: set[str], unit: str, words: list[str]) -> Kind:
         return Kind.OTHER
     if place:
         return Kind.UNKNOWN if "d" in flags else Kind.POSITION
-    by_unit = {
-        "s": Kind.TIME,
-        "ms": Kind.TIME,
-        "us": Kind.TIME,
-        "ns": Kind.TIME,
-        "N m": Kind.TORQUE,
-        "mN m": Kind.TORQUE,
-    }
+    by_unit = {**dict.fromkeys(("s", "ms", "us", "ns"), Kind.TIME), "N m": Kind.TORQUE, "mN m": Kind.TORQUE}
     by_unit |= {"rad": Kind.POSITION, "deg": Kind.POSITION, "mm": Kind.POSITION, "rpm": Kind.VELOCITY}
     by_unit |= {"rad/s": Kind.VELOCITY, "deg/s": Kind.VELOCITY, "V": Kind.VOLTAGE, "A": Kind.CURRENT, "N": Kind.TORQUE}
     by_unit |= {"m/s": Kind.VELOCITY, "mm/s": Kind.VELOCITY, "m": Kind.POSITION, "cm": Kind.POSITION}
