@@ -326,7 +326,14 @@ def _part(every: Particles | None, space: ParameterSpace) -> Particles | None:
 
 def _promises(structures: Structures) -> tuple[Promise, ...]:
     tried = {label for one in structures.fitted for label in one.labels}
+    failed = {label for labels in structures.state.failed for label in labels}
     return tuple(
-        Promise(offer.label, structures.search.placed[offer.label].sentence, offer.gain, offer.label in tried)
+        Promise(
+            offer.label,
+            structures.search.placed[offer.label].sentence,
+            offer.gain,
+            offer.label in tried,
+            offer.label in failed,
+        )
         for offer in structures.offers()
     )

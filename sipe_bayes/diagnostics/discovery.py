@@ -57,12 +57,14 @@ class Promise:
         sentence: what it is.
         gain: log-likelihood that it is to gain, in nats.
         fitted: whether it was fitted.
+        unfinished: whether a fit of it was not brought to its end.
     """
 
     label: str
     sentence: str
     gain: float
     fitted: bool
+    unfinished: bool = False
 
 
 @dataclass(frozen=True)

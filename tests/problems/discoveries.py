@@ -63,7 +63,10 @@ def make_discovery(*pieces: Piece, rows: int = 2) -> Discovery:
         columns=(),
         rows=(row("dry friction at hinge", probability=0.97), *[row() for _ in range(rows - 1)]),
         pieces=pieces,
-        promises=(Promise("dry_friction:hinge", "dry friction at hinge", 44.0, True),),
+        promises=(
+            Promise("dry_friction:hinge", "dry friction at hinge", 44.0, True),
+            Promise("spring:hinge", "a spring at hinge", 2.0, False, True),
+        ),
         posterior=posterior,
         prior=prior(posterior.space),
         parameters=tuple(summaries(posterior)),

@@ -173,6 +173,7 @@ def test_page_says_it_all_and_escapes_names() -> None:
         "The nearest element is LuGre",
         "Delay at angle is of the measurement and has no place in discovered.xml",
         "Not decided: drag at hinge: probability 0.30",
+        "a spring at hinge +2.0 not to its end",
         "Next: sipe calibrate runs/pendulum-discover/discovered.toml",
     ):
         assert words in page.text, words

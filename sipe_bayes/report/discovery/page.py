@@ -95,7 +95,12 @@ def _context(discovery: Discovery, images: Sequence[Picture]) -> Mapping[str, ob
         "structures": structures,
         "cost": nats(discovery.cost).lstrip("+"),
         "promises": [
-            {"what": p.sentence, "gain": nats(p.gain), "fitted": "yes" if p.fitted else ""} for p in discovery.promises
+            {
+                "what": p.sentence,
+                "gain": nats(p.gain),
+                "fitted": "yes" if p.fitted else "not to its end" if p.unfinished else "",
+            }
+            for p in discovery.promises
         ],
         "values": [row for row in rows if not row["added"]],
         "added": [row for row in rows if row["added"]],
