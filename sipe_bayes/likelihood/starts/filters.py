@@ -41,9 +41,9 @@ class FilterStarts:
         names: Sequence[str | None],
         known: BoolArray | bool,
     ) -> None:
-        model = self._model = copy.copy(simulator.model)
-        self._environment, self._space = simulator.environment, simulator.space
+        model, self._environment, self._space = simulator.model, simulator.environment, simulator.space
         self._filters = [] if np.all(known) else filtered_commands(model)
+        self._model = copy.copy(model) if self._filters else model
         self._age, self._names = age, list(names)
         self._timestep = [simulator.physics_steps(float(seconds))[1] for seconds in dt]
         self._known = np.broadcast_to(known, len(states))
