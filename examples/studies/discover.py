@@ -43,7 +43,7 @@ from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.structure import discover
-from sipe_bayes.structure.extension import Placed, extended, placements
+from sipe_bayes.structure.extension import Placed, extended, members, placements
 from sipe_bayes.structure.fitted import Fitting
 from sipe_bayes.structure.machine import Machine, machine_of
 from sipe_bayes.structure.registry import get_extension
@@ -162,7 +162,7 @@ def recorded(name: str, effect: str, size: float, rho: float, seed: int) -> tupl
         seen = Trajectories.stack([Trajectory(quiet.observations[0], actions[0], DT, channels=quiet.channels)])
         windows = Windows(Segments(), simulator, seen)
         machine = machine_of(windows, theta, windows.no_starts())
-        choices = list(placements(get_extension(effect), machine))
+        choices = [p for p in placements(get_extension(effect), machine) if len(members(p.site)) == 1]
         one = choices[seed % len(choices)]
         label, truth = one.label, values(one, machine, size)
         environment = simulator.environment

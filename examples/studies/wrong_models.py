@@ -53,7 +53,7 @@ from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
-from sipe_bayes.structure.extension import Placed, extended, placements
+from sipe_bayes.structure.extension import Placed, extended, members, placements
 from sipe_bayes.structure.machine import Machine, machine_of
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
 
@@ -84,7 +84,7 @@ def recorded(name: str, effect: str, seed: int, size: float) -> tuple[sipe.Simul
         seen = Trajectories.stack([Trajectory(quiet.observations[0], actions[0], DT, channels=quiet.channels)])
         windows = Windows(Segments(), simulator, seen)
         machine = machine_of(windows, truth, windows.no_starts())
-        choices = list(placements(get_extension(effect), machine))
+        choices = [p for p in placements(get_extension(effect), machine) if len(members(p.site)) == 1]
         one = choices[seed % len(choices)]
         assert isinstance(simulator.environment, MjcfEnvironment)
         engine = sipe.Simulator(extended(simulator.environment, [one]), num_threads=1)

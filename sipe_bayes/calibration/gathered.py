@@ -12,7 +12,7 @@ import numpy as np
 import scipy.optimize
 import torch
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.findings import Code, Finding, Severity, finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
@@ -23,6 +23,7 @@ from sipe_bayes.diagnostics.records import ChannelScore, LogReport, Ridge, impro
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.poses import has_pose
+from sipe_bayes.likelihood.quadratic_prior import UNIFORM_PRECISION
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.likelihood.starts.estimates import tied_joints, unmeasured_joints
 from sipe_bayes.likelihood.windows import Windows
@@ -73,6 +74,7 @@ class Marginals:
         sd: (N,) in theta.
         contraction: (N,) 1 - sd / prior sd.
         draws: (n, N) in units.
+        known: (N,) those that the prior alone determines well.
         natural: names of those whose lower bound is the smallest physical value.
     """
 
@@ -81,15 +83,17 @@ class Marginals:
     sd: FloatArray
     contraction: FloatArray
     draws: FloatArray
+    known: BoolArray
     natural: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, posterior: Posterior, prior: Posterior, seed: int, natural: frozenset[str] = frozenset()) -> Marginals:
         """Those of a posterior, which started from a prior."""
         sd = posterior.stddev.numpy()
-        contraction = 1 - sd / np.maximum(prior.stddev.numpy(), 1e-300)
+        before = np.maximum(prior.stddev.numpy(), 1e-300)
+        known = before < (1 - THRESHOLDS.well_determined) / math.sqrt(UNIFORM_PRECISION)
         draws = posterior.values(_DRAWS, generator=torch.Generator().manual_seed(seed))
-        return cls(posterior.space, most_probable(posterior), sd, contraction, draws, natural)
+        return cls(posterior.space, most_probable(posterior), sd, 1 - sd / before, draws, known, natural)
 
     def worth_measuring(self) -> list[Finding]:
         """The one parameter on which most of the others hang, if there is one."""
@@ -120,7 +124,7 @@ class Marginals:
             if beyond is not None and p.log is None:
                 low, high = (float(p.value(float(end))) for end in beyond[:, j])
                 ends = min(low, q05), max(high, q95)
-            summaries.append(ParameterSummary(p.name, p.unit, p.targets, *marginal, ends))
+            summaries.append(ParameterSummary(p.name, p.unit, p.targets, *marginal, ends, bool(self.known[j])))
         return summaries
 
     def cut_at_bounds(self, summaries: Sequence[ParameterSummary]) -> list[Finding]:
@@ -186,7 +190,7 @@ class Marginals:
             elif pieces:
                 ranges = ", ".join(f"{p.value(a):.4g} to {p.value(b):.4g}" for a, b in pieces)
                 noticed.append(about(Code.DEAD_RANGE, ranges=ranges))
-            if self.contraction[j] < THRESHOLDS.not_determined:
+            if self.contraction[j] < THRESHOLDS.not_determined and not self.known[j]:
                 severity = Severity.NOTE if idle or p.name in on_ridge else Severity.CAUTION
                 contraction = float(self.contraction[j])
                 noticed.append(about(Code.NOT_DETERMINED, severity=severity, contraction=contraction))

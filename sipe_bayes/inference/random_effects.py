@@ -5,7 +5,8 @@ parameters of log k are drawn around common ones,
 
 .. math:: \theta_k \sim \mathcal N(\mu, \operatorname{diag}(\tau^2)), \qquad \tau_j \sim |\mathcal N(0, s^2)|,
 
-with mu uniform on the cube, or as the prior has it, and s in units of the range. Log k enters by its optimum m_k and
+with mu uniform on the cube, or as the prior has it, and s a share of the range, as much less as the prior knows the
+parameter better than a uniform one: what was weighed weighs the same in every log. Log k enters by its optimum m_k and
 information L_k, exp(-(theta_k - m_k)' L_k (theta_k - m_k) / 2), whose theta_k is integrated in closed form. With S =
 diag(tau) that leaves
 
@@ -50,7 +51,7 @@ _MIDDLE = 3.0  # precision around the cube's middle, by which mu is drawn and wh
 class RandomEffectsOptions(Options):
     """How the spread between logs is sampled."""
 
-    spread: float = option(0.25, "of a value between logs, as the prior's scale has it", "of the range", above=0)
+    spread: float = option(0.25, "of a value of which nothing is known between logs", "of the range", above=0)
     walkers: int = option(4, "for each parameter: emcee asks for twice as many as dimensions", least=2)
     warmup: int = option(300, "steps until the walkers have spread", "steps", least=1)
     steps: int = option(400, "steps that are kept, every tenth of them", "steps", least=10)
@@ -115,11 +116,12 @@ def random_effects(
         raise ValueError(f"logs: expected two or more, got {len(logs)}; one log tells nothing of what differs")
     options = options or RandomEffectsOptions()
     logs = [log.determined for log in logs]
+    quadratic = QuadraticPrior.of(prior)
     model = _Model(
         np.stack([log.information for log in logs]),
         np.stack([log.mean for log in logs]),
-        QuadraticPrior.of(prior),
-        options.spread,
+        quadratic,
+        options.spread * _open(quadratic),
     )
     random = np.random.default_rng(seed)
     tau = np.repeat(model.sampled(options, random), options.tries, axis=0)
@@ -136,14 +138,20 @@ def random_effects(
     return RandomEffects(common, new_log, tau)
 
 
+def _open(prior: QuadraticPrior) -> FloatArray:
+    """The prior's sds (N,) in those of a uniform one."""
+    precision = prior.precision + UNIFORM_PRECISION * np.eye(len(prior.mean))
+    return np.asarray(np.sqrt(UNIFORM_PRECISION * np.diag(np.linalg.inv(precision))))
+
+
 @dataclass(frozen=True)
 class _Model:
-    """K logs: information (K, N, N) and mean (K, N); scale of tau's prior."""
+    """K logs: information (K, N, N) and mean (K, N); scale (N,) of tau's prior."""
 
     information: FloatArray
     mean: FloatArray
     prior: QuadraticPrior
-    scale: float
+    scale: FloatArray
 
     def shared(self, tau: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Given tau (W, N): log-likelihood (W,) without mu, precision (W, N, N) and pull (W, N) of mu."""

@@ -138,3 +138,15 @@ def test_the_same_seed_gives_the_same_draws() -> None:
     estimates = logs([0.4, 0.6], [0.01, 0.02])
     first, second = (random_effects(estimates, default_prior(space(1)), seed=3) for _ in range(2))
     assert (first.common.theta == second.common.theta).all()
+
+
+def test_what_is_known_beforehand_is_the_same_in_every_log() -> None:
+    """A mass that was weighed stands still where the logs do not tell it, whatever a gain beside it does."""
+    parameters = [Parameter("mass", 0.0, 1.0, prior_mean=0.6, prior_sd=0.004), Parameter("gain", 0.0, 1.0)]
+    known = default_prior(ParameterSpace(parameters))
+    ridge = np.array([[1.0, -1.0], [-1.0, 1.0]]) * 1e4  # only mass - gain is told
+    estimates = [LogEstimate(str(k), np.array([0.5, gain]), ridge) for k, gain in enumerate((0.48, 0.52, 0.5, 0.49))]
+    low, high = random_effects(estimates, known, 0).new_log.quantile([0.05, 0.95]).numpy()
+    print(low, high)
+    assert 0.59 < low[0] < high[0] < 0.61
+    assert 0.5 < low[1] < high[1] < 0.75

@@ -20,7 +20,7 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.extension import extended, placements
+from sipe_bayes.structure.extension import extended, members, placements
 from sipe_bayes.structure.machine import Machine, machine_of
 from sipe_bayes.structure.registry import get_extension
 
@@ -115,7 +115,7 @@ def _with_effect(
 ) -> tuple[Simulator, FloatArray]:
     """The machine with the effect at one of its joints, and its theta."""
     assert isinstance(simulator.environment, MjcfEnvironment)
-    choices = list(placements(get_extension(planted.extension), machine))
+    choices = [p for p in placements(get_extension(planted.extension), machine) if len(members(p.site)) == 1]
     placed = choices[number % len(choices)]
     values = [planted.share, *(float(p.value(0.5)) for p in placed.parameters[1:])]
     if planted.extension == "gear_backlash":

@@ -174,18 +174,20 @@ class _Causes:
         pull, noise, memory = -windows.start_precision * logs.starts, logs.noise, logs.memory
         span = float(windows.dt.min()), windows.trajectories.longest
         usable = np.array([not probe.by_log for probe in logs.probes], bool)
+        prior, prior_pull = FLAT_PRECISION * np.eye(logs.count), np.zeros(logs.count)
+        prior[:n, :n], prior_pull[:n] = logs.inner, logs.pull
         for _ in range(options.rounds):
             normal = logs.rows.normal(logs.residual, remembering(noise, memory))
             arrow = eliminate_starts(normal, logs.count, windows.start_precision, pull)
-            precision, gradient = arrow.precision + FLAT_PRECISION * np.eye(logs.count), arrow.gradient
+            precision, gradient = arrow.precision + prior, arrow.gradient + prior_pull
             alpha = sparse(precision, gradient, n, usable, logs.one_sided, options)
             kept = np.flatnonzero(np.isfinite(alpha))
             columns = np.concatenate([np.arange(n), n + kept])
-            beliefs = np.diag(np.concatenate([np.zeros(n), alpha[kept]]))
-            covariance = np.linalg.inv(precision[np.ix_(columns, columns)] + beliefs)
+            among, beliefs = np.ix_(columns, columns), np.diag(np.concatenate([np.zeros(n), alpha[kept]]))
+            covariance = np.linalg.inv(precision[among] + beliefs)
             pulls = Pulls(
-                beliefs + FLAT_PRECISION * np.eye(len(columns)),
-                np.zeros(len(columns)),
+                beliefs + prior[among],
+                prior_pull[columns],
                 windows.start_precision,
                 pull,
                 np.ones(len(columns), bool),
