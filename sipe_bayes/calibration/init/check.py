@@ -36,10 +36,12 @@ from sipe_bayes.calibration.init.windows import (
 )
 from sipe_bayes.calibration.problem import environment_of
 from sipe_bayes.calibration.readers.tables import read_table
+from sipe_bayes.core.units import find_unit
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 
 _LOGS = 3  # that are simulated
 _BETTER = np.log(1.5)  # of the logarithm of misses together, from which another reading is named
+_ROOM = 0.05  # of a ctrlrange, by which a command may lie beyond it
 _ROUNDS = 12  # of the fits with either reading: a model that is far off speaks for wrong units
 
 
@@ -96,11 +98,14 @@ def checked(path: Path) -> Checked:
         late, note = delay_of([c.actuator for c in config.commands], left, logs[0].dt)
         delays = [p for p in config.parameters if any(t.endswith(".delay") for t in p.targets)]
         if late and not delays and not model.actuator_delay.any():
-            out.append(f"parameters: {note}; ask for actuator:{config.commands[0].actuator}.delay")
+            targets = ", ".join(f"actuator:{command.actuator}.delay" for command in config.commands)
+            out.append(f"parameters: {note}; ask for {'one of ' * (len(config.commands) > 1)}{targets}")
         if late and delays and left.best * logs[0].dt > max(p.range[1] for p in delays):
             out.append(f"parameters: {note}, beyond the bounds of {delays[0].name!r}; widen them")
     doubts = [doubt for doubt in better.open_doubts if doubt != draft.clock.doubt]
-    return Checked(out + _slopes(draft, opened) + _turns(draft, opened), doubts)
+    return Checked(
+        out + _clipped(config, draft, machine, opened) + _slopes(draft, opened) + _turns(draft, opened), doubts
+    )
 
 
 def _draft_of(config: Config, opened: Opened, folder: Path) -> Draft:
@@ -172,6 +177,25 @@ def _swapped(draft: Draft, trial: Trial) -> tuple[float, list[str]]:
         return 0.0, []
     times = f"simulated windows miss {np.exp(gain / count):.2g} times as much as the other way round"
     return gain, [f"{names} look swapped: {times}"]
+
+
+def _clipped(config: Config, draft: Draft, machine: Machine, opened: Opened) -> list[str]:
+    """Commands most of which the ctrlrange of their actuator cuts off."""
+    limits = {f"actuator:{actuator.name}": actuator.limits for actuator in machine.actuators}
+    out = []
+    for entry, r in zip(config.commands, draft.commands, strict=True):
+        ends, fed = limits.get(r.match.target), (r.supply[0],) if r.supply else ()
+        if ends is None or entry.rate is not None or any(name not in opened.columns for name in (r.match.column, *fed)):
+            continue
+        values = (opened.columns[r.match.column] - r.zero) * r.sign * r.factor * find_unit(r.unit).factor
+        if r.supply:
+            values = values * opened.columns[r.supply[0]] * find_unit(r.supply[1]).factor
+        room = _ROOM * (ends[1] - ends[0])
+        share = float(np.mean((values < ends[0] - room) | (values > ends[1] + room)))
+        if share > 0.5:
+            where = f"commands, column {r.match.column!r}: {100 * share:.0f} % of it lies outside of the ctrlrange"
+            out.append(f"{where} {list(ends)} of {r.match.target}, which cuts it off; look at its factor, zero, supply")
+    return out
 
 
 def _slopes(draft: Draft, opened: Opened) -> list[str]:

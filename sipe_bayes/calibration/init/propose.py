@@ -369,7 +369,8 @@ def _some(unknowns: list[Unknown]) -> tuple[list[Unknown], list[str]]:
     if any(not unknown.left_out for unknown in unknowns):
         relative = [u for u in unknowns if u.left_out == RELATIVE]
         doubts = [
-            f"no force is known: all forces and masses are relative to {u.name}, {u.note}; weigh it" for u in relative
+            f"no force is known: all forces and masses are relative to {u.name}, {u.note}; weigh it, correct the model"
+            for u in relative
         ]
         return unknowns, doubts
     if not unknowns:

@@ -8,9 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from sipe_bayes.calibration.init.check import checked
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.write import toml_of
 from sipe_bayes.calibration.problem import prepare
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.simulation.simulator import Simulator
@@ -19,6 +21,20 @@ CART = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody
   <joint name="rail" type="slide" axis="1 0 0" damping="2"/><geom size=".1" mass="1"/></body></worldbody><actuator>
   <motor name="fan" joint="rail" gear="GEAR" ctrllimited="true" ctrlrange="RANGE"/></actuator></mujoco>"""
 DT, STEPS = 0.01, 500
+TIME = DT * np.arange(STEPS)
+SWAY = np.sin(2.1 * TIME) * np.cos(0.7 * TIME)
+
+
+def _record(folder: Path, limits: str, gear: float, column: str, pulses: FloatArray, actions: FloatArray) -> None:
+    """A cart's model and log, with a battery."""
+    (folder / "cart.xml").write_text(CART.replace("RANGE", limits).replace("GEAR", f"{gear}"))
+    damping = Parameter("damping", 0.0, 4.0, targets=("joint:rail.damping",))
+    environment = MjcfEnvironment.build(folder / "cart.xml", [damping], ["fan"], ["joint:rail.position"])
+    simulator, rng = Simulator(environment, 1), np.random.default_rng(0)
+    run = simulator.rollout(np.full((1, 1), 0.5), actions[None, :, None], simulator.default_state()[None], DT)
+    seen = run.observations[0, :-1, 0] + 1e-4 * rng.standard_normal(STEPS)
+    columns = {"time": TIME, "rail_m": seen, column: pulses, "vbat": np.full(STEPS, 16.2)}
+    pd.DataFrame(columns).to_csv(folder / "log.csv", index=False)
 
 
 @pytest.mark.parametrize(
@@ -34,16 +50,9 @@ def test_pulses_become_shares_of_the_ctrlrange(
     tmp_path: Path, limits: str, column: str, low: int, high: int, zero: float, span: float
 ) -> None:
     """And the battery beside them does not scale what a ctrlrange of one takes."""
-    (tmp_path / "cart.xml").write_text(CART.replace("RANGE", limits).replace("GEAR", f"{6 if span > 1 else 0.01}"))
-    damping = Parameter("damping", 0.0, 4.0, targets=("joint:rail.damping",))
-    environment = MjcfEnvironment.build(tmp_path / "cart.xml", [damping], ["fan"], ["joint:rail.position"])
-    simulator, time, rng = Simulator(environment, 1), DT * np.arange(STEPS), np.random.default_rng(0)
-    sway = np.sin(2.1 * time) * np.cos(0.7 * time)
-    pulses = np.round((low + high) / 2 + (high - low) / 2 * sway)
-    actions = ((pulses - zero) / span)[None, :, None]
-    seen = simulator.rollout(np.full((1, 1), 0.5), actions, simulator.default_state()[None], DT).observations[0, :-1, 0]
-    columns = {"time": time, "rail_m": seen + 1e-4 * rng.standard_normal(STEPS), column: pulses}
-    pd.DataFrame(columns | {"vbat": np.full(STEPS, 16.2)}).to_csv(tmp_path / "log.csv", index=False)
+    pulses = np.round((low + high) / 2 + (high - low) / 2 * SWAY)
+    actions = (pulses - zero) / span
+    _record(tmp_path, limits, 6 if span > 1 else 0.01, column, pulses, actions)
     draft = propose(tmp_path / "cart.xml", [tmp_path / "log.csv"], tmp_path, None)
     (command,) = draft.commands
     print(command)
@@ -52,4 +61,17 @@ def test_pulses_become_shares_of_the_ctrlrange(
     assert not any("outside of the ctrlrange" in doubt for doubt in draft.open_doubts), draft.open_doubts
     (tmp_path / "calibrate.toml").write_text(toml_of(draft, "sipe init"))
     held = prepare(tmp_path / "calibrate.toml", 1).train.actions[0, :200, 0]
-    np.testing.assert_allclose(held, actions[0, :200, 0], atol=1e-6)
+    np.testing.assert_allclose(held, actions[:200], atol=1e-6)
+
+
+def test_a_command_that_its_ctrlrange_cuts_off_is_odd(tmp_path: Path) -> None:
+    """As a share that is scaled by the battery's volts: the check says so, and of the right one nothing."""
+    pulses = np.round(1450 + 450 * SWAY)
+    _record(tmp_path, "0 1", 6, "pwm", pulses, (pulses - 1000) / 1000)
+    right = toml_of(propose(tmp_path / "cart.xml", [tmp_path / "log.csv"], tmp_path, None), "sipe init")
+    for name, text in {"right": right, "wrong": right.replace("zero = 1000.0", "zero = 100.0")}.items():
+        (tmp_path / f"{name}.toml").write_text(text)
+    assert not any("ctrlrange" in line for line in checked(tmp_path / "right.toml").odd)
+    odd = checked(tmp_path / "wrong.toml").odd
+    cut = "% of it lies outside of the ctrlrange [0.0, 1.0] of actuator:fan"
+    assert any("column 'pwm'" in line and cut in line for line in odd), odd

@@ -32,6 +32,7 @@ Families = Mapping[str, list[Label]]
 _NEVER = -2.0
 _EXACTLY = 0.5  # for a column that has all words of a joint's name, over one that has those of another's body
 _CALLED = 0.65  # how alike a column and a joint are, from which it is called after it
+_TENDONS = 0.3  # how alike a column and a tendon's actuator are, from which it is called after that and not a joint
 _BACK = 0.01  # of its steps, from which a column that goes back is no clock
 _RIVAL = 3.0  # by which a column for a command may fit worse than the chosen one and still be named
 
@@ -47,6 +48,7 @@ def match_columns(machine: Machine, table: Table) -> Matches:
     labels = _called_as_actuators(machine, _called_as_joints(machine, labels), _SAYS_NOTHING)
     unnamed = {label.column for label in labels if label.kind == Kind.UNKNOWN}
     labels, open_commands = _unravelled(machine, labels, table)
+    labels, of_tendons = _of_tendons(machine, labels)
     offsets = _ordinals(labels)
     positions = _assigned(machine.joints, labels, Kind.POSITION, offsets)
     velocities = _by_position(positions, _assigned(machine.joints, labels, Kind.VELOCITY, offsets), table)
@@ -59,10 +61,27 @@ def match_columns(machine: Machine, table: Table) -> Matches:
     positions += _left_over(machine, positions, spare, table)
     used |= {match.column for match in positions}
     left = tuple(name for name in table if name not in used)
-    doubts = (*open_vectors, *open_commands)
+    doubts = (*open_vectors, *open_commands, *of_tendons)
     return Matches(
         tuple(positions), tuple(velocities), tuple(commands), tuple(vectors), tuple(rivals), left, doubts, tuple(forces)
     )
+
+
+def _of_tendons(machine: Machine, labels: list[Label]) -> tuple[list[Label], list[str]]:
+    """Labels of which those called as an actuator of a tendon, and as no joint, measure no joint; and what they may."""
+    pulling = [actuator.name for actuator in machine.actuators if actuator.tendon and actuator.joint is None]
+    joints = [name for joint in machine.joints for name in (joint.name, joint.body)]
+
+    def called(label: Label, names: Sequence[str]) -> float:
+        return max((alike(label.words, name) for name in names), default=0.0)
+
+    kinds = (Kind.POSITION, Kind.VELOCITY)
+    away = {x.column for x in labels if x.kind in kinds and called(x, pulling) > max(called(x, joints), _TENDONS)}
+    if not away:
+        return labels, []
+    which = ", ".join(map(repr, sorted(away)))
+    doubt = f"{which}: called as what pulls a tendon, and no joint's; a <tendonpos> of the MJCF may be their target"
+    return [replace(x, kind=Kind.OTHER) if x.column in away else x for x in labels], [doubt]
 
 
 def _left_over(machine: Machine, positions: Sequence[Match], unnamed: Sequence[Label], table: Table) -> list[Match]:

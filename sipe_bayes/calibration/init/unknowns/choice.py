@@ -14,7 +14,7 @@ from sipe_bayes.calibration.init.unknowns.alike import SHARED, shared, together
 from sipe_bayes.calibration.init.unknowns.candidates import least_of
 from sipe_bayes.core.arrays import FloatArray
 
-RELATIVE = "no force is known, so that all others are relative to it; weigh it"
+RELATIVE = "no force is known, so that all others are relative to it; weigh it and write it into the model"
 """Why a mass is left out."""
 _NOTABLE = 0.03  # of its range, from which a spring is told
 MOST = 30

@@ -246,3 +246,18 @@ def test_joints_of_one_letter_are_no_quantities(joints: tuple[str, str], columns
     assert [match.column for match in taken] == names[:6]
     assert [match.target.split(":")[1].split(".")[0].removeprefix("motor_") for match in taken] == [*joints] * 3
     assert list(matches.left) == names[6:]
+
+
+FINGER = """<mujoco><worldbody><site name="palm"/><body name="proximal"><joint name="mcp"/><geom size=".1" mass="1"/>
+<body name="distal"><joint name="dip"/><geom size=".1" mass="1"/><site name="tip" pos="1 0 .1"/></body></body>
+</worldbody><tendon><spatial name="flexor"><site site="palm"/><site site="tip"/></spatial></tendon>
+<actuator><motor name="flexor_motor" tendon="flexor"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(("beside", "doubted"), [("enc_flexor", True), ("enc_dip", False), ("enc_b", False)])
+def test_the_encoder_of_what_pulls_a_tendon_measures_no_joint(beside: str, doubted: bool) -> None:
+    matches = matched(Machine.of(mujoco.MjModel.from_xml_string(FINGER)), ["cmd_flexor_mA", "mcp_deg", beside])
+    targets = {m.column: m.target for m in matches.positions}
+    assert targets == {"mcp_deg": "joint:mcp.position"} | ({} if doubted else {beside: "joint:dip.position"})
+    assert any("called as what pulls a tendon" in doubt for doubt in matches.doubts) == doubted
+    assert [m.column for m in matches.commands] == ["cmd_flexor_mA"]
