@@ -53,7 +53,7 @@ def published_acceleration(
 
 def simulate_published(windows: Windows) -> NDArray[np.float64]:
     """Angles (W, L) of the published model over the windows: MuJoCo has no arctangent friction, so by Runge-Kutta."""
-    starts = windows.states(windows.no_starts())
+    starts = windows.reference
     angle, rate = starts[:, 1].copy(), starts[:, 2].copy()
     path = [angle.copy()]
     for k in range(windows.actions.shape[1]):

@@ -33,6 +33,7 @@ from sipe_bayes.simulation.simulator import Simulator
 _FREE = 0  # mjJNT_FREE
 _DRAWS = 4000  # of the posterior: quantiles to one or two percent of an sd
 _CUT = 2e-3  # of the range, within which an interval ends at a bound
+_MOVED = 2.0  # prior sds, by which logs that move a value say something else than its prior
 _DIFFERENT, _APART = 0.1, 3.0  # of the mean of the logs, and sds of a difference
 _NO_BODY = 0.01  # of the posterior, from which it is told
 _NAMED = 3  # logs of what is summed up
@@ -74,7 +75,7 @@ class Marginals:
         sd: (N,) in theta.
         contraction: (N,) 1 - sd / prior sd.
         draws: (n, N) in units.
-        known: (N,) those that the prior alone determines well.
+        known: (N,) those that the prior alone determines well, and of which the logs do not say otherwise.
         natural: names of those whose lower bound is the smallest physical value.
     """
 
@@ -91,7 +92,8 @@ class Marginals:
         """Those of a posterior, which started from a prior."""
         sd = posterior.stddev.numpy()
         before = np.maximum(prior.stddev.numpy(), 1e-300)
-        known = before < (1 - THRESHOLDS.well_determined) / math.sqrt(UNIFORM_PRECISION)
+        moved = np.abs(posterior.mean.numpy() - prior.mean.numpy()) / before
+        known = (before < (1 - THRESHOLDS.well_determined) / math.sqrt(UNIFORM_PRECISION)) & (moved < _MOVED)
         draws = posterior.values(_DRAWS, generator=torch.Generator().manual_seed(seed))
         return cls(posterior.space, most_probable(posterior), sd, 1 - sd / before, draws, known, natural)
 

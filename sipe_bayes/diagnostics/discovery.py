@@ -57,7 +57,7 @@ class Promise:
         sentence: what it is.
         gain: log-likelihood that it is to gain, in nats.
         fitted: whether it was fitted.
-        unfinished: whether a fit of it was not brought to its end.
+        unfinished: whether a fit with it, alone or beside others, could not be brought to its end.
     """
 
     label: str

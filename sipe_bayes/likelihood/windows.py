@@ -141,8 +141,8 @@ class Windows:
         past = past_commands(simulator, trajectories, self.log, self.start, self.dt)
         recorded = are_states(simulator, trajectories.states)
         self.reference = with_history(simulator, reference, past, self.dt, self.start, recorded)
-        self.number, age = np.arange(len(self.log)), self.start * self.dt
-        self.filters = FilterStarts(simulator, self.reference, past, age, self.dt, self.names, recorded)
+        self.number = np.arange(len(self.log))
+        self.filters = FilterStarts(simulator, trajectories, self.reference, self.log, self.start, recorded)
         free = start_sd(simulator, trajectories) if self.settings.starts == "estimated" else np.zeros(0)
         self.num_start, self.start_precision = len(free), free**-2.0
 

@@ -60,7 +60,7 @@ def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdic
     problems = [TEXTS[code].row for code in _PROBLEMS if code in codes and code not in allowed]
     if problems:
         return Verdict("bad", ", ".join(problems))
-    as_known = parameter.known and parameter.contraction < THRESHOLDS.well_determined
+    as_known = parameter.known and -THRESHOLDS.idle < parameter.contraction < THRESHOLDS.well_determined
     if as_known and not _wide(parameter, -THRESHOLDS.well_determined):
         return Verdict("fair" if findings.blocking else "good", "as known beforehand")
     if shared:  # a wider interval that is the prior's says nothing of one alone

@@ -65,3 +65,15 @@ def test_a_posterior_that_no_rigid_body_can_have_is_told(across: float, middle: 
     noticed = no_rigid_bodies(Simulator(environment, 1), normal, 0)
     assert [one.code for one in noticed] == [Code.NO_RIGID_BODY] * (share > 0)
     assert all(abs(float(one.text.split("in ")[1].split(" %")[0]) - share) <= 3 for one in noticed)
+
+
+@pytest.mark.parametrize(("moved", "sd", "known"), [(0.0, 0.01, True), (0.015, 0.01, True), (0.03, 0.008, False)])
+def test_what_was_weighed_is_not_asked_to_be_determined(moved: float, sd: float, known: bool) -> None:
+    """But where the logs say something else than the prior, which they have not made much narrower."""
+    weighed = Parameter("mass", 0.0, 1.0, targets=("body:cart.mass",), prior_mean=0.5, prior_sd=0.01)
+    space = ParameterSpace([weighed, Parameter("gain", 0.0, 1.0, targets=("actuator:drive.gain",))])
+    normal = GaussianMixture([0.0], np.array([[0.5 + moved, 0.5]]), np.diag([sd**2, 0.28**2])[None], space)
+    own = Marginals.of(normal, prior(space), 0)
+    assert [one.known for one in own.summaries()] == [known, False]
+    asked = [one.parameters for one in own.findings({}) if one.code is Code.NOT_DETERMINED]
+    assert asked == ([] if known else [("mass",)]) + [("gain",)]

@@ -53,6 +53,9 @@ def parameter(contraction: float = 0.9, nuisance: bool = False) -> ParameterSumm
     return ParameterSummary("mass", "kg", (), 1, 0.1, 0.9, 1, 1.1, 1, 1, contraction, nuisance)
 
 
+KNOWN = dataclasses.replace(parameter(0.05), known=True)
+
+
 def of_mass(*codes: Code) -> Findings:
     return Findings(noticed(code, "mass") for code in codes)
 
@@ -73,6 +76,11 @@ def of_mass(*codes: Code) -> Findings:
         (parameter(0.99), (Code.AT_PHYSICAL_BOUND, Code.MISFIT), "bad", "model lacks something"),
         (parameter(0.99), (Code.DEAD_RANGE,), "fair", "part of its range changes nothing"),
         (dataclasses.replace(parameter(1.0), sd=0.0), (), "fair", "a point without uncertainty"),
+        (KNOWN, (), "good", "as known beforehand"),
+        (dataclasses.replace(KNOWN, further=(0.8, 1.2)), (), "good", "as known beforehand"),
+        (dataclasses.replace(KNOWN, further=(0.0, 2.0)), (), "fair", "weakly determined"),
+        (dataclasses.replace(KNOWN, contraction=-0.5), (), "fair", "weakly determined"),
+        (dataclasses.replace(KNOWN, contraction=0.9), (), "good", "determined"),
     ],
 )
 def test_verdict_on_a_parameter(summary: ParameterSummary, codes: tuple[Code, ...], tone: str, words: str) -> None:

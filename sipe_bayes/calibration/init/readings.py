@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sipe_bayes.calibration.init.columns.match import Match, Matches
-from sipe_bayes.calibration.init.columns.names import SIDES, Kind, pieces_of, read_name
+from sipe_bayes.calibration.init.columns.names import SIDES, Kind, Label, pieces_of, read_name
 from sipe_bayes.calibration.init.columns.signals import Slope, likeness, slope_of, turn_of, white_share
 from sipe_bayes.calibration.init.draft import Reading, Scale
 from sipe_bayes.calibration.init.machine import Actuator, Drive, Machine
@@ -200,7 +200,7 @@ def _command(actuator: Actuator, match: Match, matches: Matches, table: Table) -
         Drive.OTHER: "1",
     }[actuator.drive]
     share = match.label.unit == "%" and actuator.drive in _SHARED
-    pulses = actuator.drive in _SHARED and _pulse(table[match.column], actuator, match.label.unit == "us")
+    pulses = actuator.drive in _SHARED and _pulse(table[match.column], actuator, match.label)
     if share or match.label.kind == Kind.DUTY or pulses:
         return _duty(match, actuator, table)
     named = match.label.unit
@@ -232,12 +232,15 @@ def _duty(match: Match, actuator: Actuator, table: Table) -> Reading:
     )
     if match.label.unit == "%" or full == _SHARES[1]:
         unit, factor = "%", 1.0
-    elif (pulse := _pulse(values, actuator, True)) and actuator.drive in _SHARED:
+    elif (pulse := _pulse(values, actuator, match.label)) and actuator.drive in _SHARED:
         zero, factor, match = pulse.none, 1 / pulse.span, replace(match, label=replace(match.label, unit=""))
         size = f"a pulse in us, nothing at {zero:g} and all at {zero + pulse.span:g}, as a speed controller takes it"
     reading = Reading(match, unit, factor=factor, zero=zero, notes=(*_matched(match), f"a duty: {size}"))
-    voltages = [name for name in table if read_name(name).kind == Kind.SUPPLY]
-    ends = np.inf if actuator.limits is None else max(actuator.limits)
+    if zero and (values == 0).any():
+        doubt = f"{match.column!r} is 0 at times, as before a controller is armed, which is read as {-zero * factor:g}"
+        reading = replace(reading, doubts=(f"{doubt}: begin the logs later",))
+    voltages = [n for n in table if read_name(n).kind == Kind.SUPPLY and np.isfinite(table[n]).any()]
+    ends = np.inf if actuator.limits is None else max(np.abs(actuator.limits))
     supplied = [float(np.nanmedian(table[name])) for name in voltages]
     if voltages and ends >= supplied[0] * (1e-3 if supplied[0] > _MILLIVOLTS else 1) / 2:
         volts = "mV" if supplied[0] > _MILLIVOLTS else "V"
@@ -260,15 +263,16 @@ class _Pulse(NamedTuple):
     span: float
 
 
-def _pulse(values: FloatArray, actuator: Actuator, named: bool) -> _Pulse | None:
+def _pulse(values: FloatArray, actuator: Actuator, label: Label) -> _Pulse | None:
     """How a command is read as pulses of a servo's or a speed controller's kind; None where it is none.
 
-    One without a name that says so is, where its actuator's ctrlrange ends far below.
+    One that is not in microseconds is, where its actuator's ctrlrange ends far below, or has none and it is a duty.
     """
     values = values[np.isfinite(values) & (values != 0)]  # 0: not armed
     if not len(values) or values.min() < _PULSES[0] or values.max() > _PULSES[1]:
         return None
-    if not named and (actuator.limits is None or max(actuator.limits) > _SHARES[1]):
+    far_below = label.kind == Kind.DUTY if actuator.limits is None else max(np.abs(actuator.limits)) <= _SHARES[1]
+    if label.unit != "us" and not far_below:
         return None
     both_ways = actuator.limits[0] < 0 if actuator.limits else not actuator.flies and values.min() < 1400
     return _Pulse(1500.0, 500.0) if both_ways else _Pulse(1000.0, 1000.0)

@@ -74,10 +74,14 @@ def filtered_commands(model: mujoco.MjModel) -> list[tuple[int, int]]:
 
 def kept_by_filter(model: mujoco.MjModel, actuator: int, timestep: float) -> float:
     """The share of where an actuator's filter was that is left a timestep (s) later, as MuJoCo integrates it."""
-    tau = float(model.actuator_dynprm[actuator, 0])
-    if int(model.actuator_dyntype[actuator]) == int(mujoco.mjtDyn.mjDYN_FILTER):
-        return max(0.0, 1 - timestep / max(tau, mujoco.mjMINVAL))
-    return float(np.exp(-timestep / tau)) if tau > 0 else 0.0
+    exact = int(model.actuator_dyntype[actuator]) != int(mujoco.mjtDyn.mjDYN_FILTER)
+    x, slope = timestep / max(float(model.actuator_dynprm[actuator, 0]), mujoco.mjMINVAL), 1.0
+    if int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4):
+        second = 1 - x / 2
+        third = 1 - x / 2 * second
+        slope = (1 + 2 * second + 2 * third + 1 - x * third) / 6
+    kept = 1 - slope * (-np.expm1(-x) if exact else x)
+    return float(kept) if abs(kept) < 1 else 0.0  # one that grows is no filter
 
 
 def filtered_command(model: mujoco.MjModel, actuator: int, past: FloatArray, timestep: float) -> float:

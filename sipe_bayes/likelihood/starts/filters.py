@@ -3,19 +3,37 @@
 A first-order filter is driven by commands alone, and a log holds them: whatever the machine does, where its filter is
 follows from the time constant and the commands before. Only where it was as the log began is not known, and of that
 ever less is left in windows that begin later. So the number of a start that tells of a filter counts by this share, and
-a lag costs its windows nothing but the first.
+a lag costs its windows nothing but the first. Before the log its first command is held.
+
+Deviations:
+
+- What is left of the log's beginning does not know a filter's limits.
+- Where MuJoCo integrates by RK4, a late command is taken as it is where a physics step begins.
 """
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+import scipy.signal
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
-from sipe_bayes.envs.internal.states import filtered_command, filtered_commands, kept_by_filter
+from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.envs.internal.states import filtered_commands, kept_by_filter
 from sipe_bayes.simulation.simulator import Simulator
+
+
+@dataclass(frozen=True)
+class _Driven:
+    """What drives the F filters of a log: commands (T, F), ``skip`` to a control step, each for ``timestep`` s."""
+
+    commands: FloatArray
+    timestep: float
+    skip: int
+    name: str | None
 
 
 class FilterStarts:
@@ -23,39 +41,46 @@ class FilterStarts:
 
     Args:
         simulator: of the model.
+        trajectories: the logs.
         states: (W, S), references of the starts.
-        past: the commands (P, A) before each window, one row a physics step.
-        age: (W,) seconds since the log began.
-        dt: (W,) seconds of a control step.
-        names: of the windows' logs.
+        log: (W,), of each window.
+        start: (W,) control steps, of each.
         known: (W,) whose filters are recorded.
     """
 
     def __init__(
         self,
         simulator: Simulator,
+        trajectories: Trajectories,
         states: FloatArray,
-        past: list[FloatArray],
-        age: FloatArray,
-        dt: FloatArray,
-        names: Sequence[str | None],
+        log: IntArray,
+        start: IntArray,
         known: BoolArray | bool,
     ) -> None:
-        model, self._environment, self._space = simulator.model, simulator.environment, simulator.space
+        model, environment = simulator.model, simulator.environment
         self._filters = [] if np.all(known) else filtered_commands(model)
         self._model = copy.copy(model) if self._filters else model
-        self._age, self._names = age, list(names)
-        self._timestep = [simulator.physics_steps(float(seconds))[1] for seconds in dt]
-        self._known = np.broadcast_to(known, len(states))
-        self._controls: list[FloatArray] = []
-        if self._filters:
-            control = simulator.environment.control
-            self._controls = [control(model, state, before) for state, before in zip(states, past, strict=True)]
+        self._environment, self._space = environment, simulator.space
+        self._log, self._start, self._known = log, start, np.broadcast_to(known, len(log))
+        self._driven: dict[int, _Driven] = {}
+        names: Sequence[str | None] = trajectories.names or [None] * len(trajectories)
+        columns = [int(model.actuator_ctrladr[actuator]) for actuator, _ in self._filters]
+        for k in np.unique(log).tolist() if self._filters else []:
+            skip, timestep = simulator.physics_steps(float(trajectories.dt[k]))
+            actions = trajectories.actions[k, : start[log == k].max() + 1]
+            commands = environment.control(model, states[int(np.argmax(log == k))], actions)[:, columns]
+            self._driven[k] = _Driven(np.repeat(commands, skip, axis=0), timestep, skip, names[k])
 
     @property
     def numbers(self) -> IntArray:
         """Which numbers of a start tell of filters."""
         return np.array([column - 1 - self._model.nq + self._model.nv for _, column in self._filters], np.int64)
+
+    def follow(self, starts: FloatArray, windows: IntArray) -> None:
+        """Set numbers of starts (..., W, D) to zero, in place, where commands before the windows tell of filters."""
+        later = np.flatnonzero(self._start[windows] > 0)
+        for number in self.numbers:
+            starts[..., later, number] = 0.0
 
     def put(self, states: FloatArray, theta: FloatArray, starts: FloatArray, windows: IntArray) -> FloatArray:
         """States (B, W, S) with the filters where they are under theta (B, N), in place.
@@ -68,31 +93,37 @@ class FilterStarts:
         """
         if not self._filters:
             return states
-        model, done = self._model, dict[tuple[str | None, float, float, int], tuple[FloatArray, FloatArray]]()
-        logs = sorted({self._names[w] for w in windows}, key=str) if self._environment.by_log else [None]
-        for log in logs:
-            own = np.array([log is None or self._names[w] == log for w in windows]) & ~self._known[windows]
-            for b, values in enumerate(self._space.values(theta)):
-                self._environment.write(model, values, log)
-                for (actuator, column), number in zip(self._filters, self.numbers, strict=True):
-                    key = (
-                        log,
-                        float(model.actuator_dynprm[actuator, 0]),
-                        float(model.actuator_delay[actuator]),
-                        actuator,
-                    )
+        model, values, numbers = self._model, self._space.values(theta), self.numbers
+        done = dict[
+            tuple[int, int, float, float], tuple[FloatArray, FloatArray]
+        ]()  # no target writes a filter's limits
+        for k in np.unique(self._log[windows]).tolist():
+            own = np.flatnonzero((self._log[windows] == k) & ~self._known[windows])
+            for b in range(len(states)):
+                self._environment.write(model, values[b], self._driven[k].name)
+                for f, (actuator, column) in enumerate(self._filters):
+                    key = (k, f, float(model.actuator_dynprm[actuator, 0]), float(model.actuator_delay[actuator]))
                     if key not in done:
-                        done[key] = self._reached(actuator, windows[own])
+                        done[key] = self._reached(k, f, self._start[windows[own]])
                     reached, left = done[key]
-                    states[b, own, column] = reached + left * starts[b, own, number]
+                    states[b, own, column] = reached + left * starts[b, own, numbers[f]]
         return states
 
-    def _reached(self, actuator: int, windows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Where a filter is as each window starts, and what is left of where it was as its log began."""
-        model, control = self._model, int(self._model.actuator_ctrladr[actuator])
-        reached, left = [], []
-        for w in windows:
-            step = self._timestep[w]
-            reached.append(filtered_command(model, actuator, self._controls[w][:, control], step))
-            left.append(kept_by_filter(model, actuator, step) ** round(self._age[w] / step))
-        return np.array(reached), np.array(left)
+    def _reached(self, k: int, f: int, start: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Where filter f of log k is at control steps (w,), and what is left of where it was as the log began."""
+        model, driven, actuator = self._model, self._driven[k], self._filters[f][0]
+        kept, commands = kept_by_filter(model, actuator, driven.timestep), driven.commands[:, f]
+        steps = np.arange(len(commands)) - float(model.actuator_delay[actuator]) / driven.timestep
+        if not model.actuator_history[actuator, 1]:  # no interpolation
+            steps = np.floor(steps + 1e-9)
+        late = np.interp(steps, np.arange(len(commands)), commands)
+        if model.actuator_ctrllimited[control := int(model.actuator_ctrladr[actuator])]:
+            late = np.clip(late, *model.actuator_ctrlrange[control])
+        place, begin = start * driven.skip, float(late[0])
+        reached: FloatArray = scipy.signal.lfilter([1 - kept], [1, -kept], late, zi=[kept * begin])[0]
+        low, high = model.actuator_actrange[actuator] if model.actuator_actlimited[actuator] else (-np.inf, np.inf)
+        if reached.min() < low or reached.max() > high:
+            now = begin = float(np.clip(begin, low, high))
+            for step, command in enumerate(late):
+                now = reached[step] = min(max(kept * now + (1 - kept) * command, low), high)
+        return np.append(begin, reached)[place].astype(np.float64), np.asarray(kept**place, np.float64)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
@@ -21,7 +19,10 @@ def past_commands(
 
     Of starts at samples ``start`` (W,) of the logs ``log`` (W,), whose control steps take ``dt`` (W,) seconds.
     """
-    longest = np.minimum(np.maximum(np.ceil(_FORGOTTEN * _slowest(simulator) / dt), 1), _LONGEST).astype(np.int64)
+    slowest = max(
+        (float(simulator.model.actuator_dynprm[k, 0]) for k, _ in filtered_commands(simulator.model)), default=0
+    )
+    longest = np.minimum(np.maximum(np.ceil(_FORGOTTEN * slowest / dt), 1), _LONGEST).astype(np.int64)
     if simulator.model.nhistory:
         longest[:] = _LONGEST
     past = []
@@ -52,14 +53,3 @@ def with_history(
     begun = simulator.environment.history(simulator.model, states, past, timestep)
     begun[:, columns] = np.where(np.reshape(recorded, (-1, 1)), own, begun[:, columns])
     return begun
-
-
-def _slowest(simulator: Simulator) -> float:
-    """The longest time constant of a filter, in the model or at the bounds of what is unknown."""
-    space, model = simulator.space, copy.copy(simulator.model)
-    filters = [k for k, _ in filtered_commands(model)]
-    slowest = max((float(model.actuator_dynprm[k, 0]) for k in filters), default=0.0)
-    for side in (0.0, 1.0) if filters else ():
-        simulator.environment.write(model, space.values(np.full(len(space), side)))
-        slowest = max(slowest, *(float(model.actuator_dynprm[k, 0]) for k in filters))
-    return slowest

@@ -242,8 +242,8 @@ def _kind(flags: set[str], unit: str, words: list[str]) -> Kind:
         return Kind.OTHER
     if "supply" in flags and not place and not flags & {"current", "torque", "other"} and unit not in ("A", "mA", "%"):
         return Kind.SUPPLY
-    of_another = place or flags & {"speed", "current", "voltage", "other"}
-    if ("duty" in flags and not of_another) or (unit == "us" and _PULSED & {*words}):
+    of_another = place or flags & {"speed", "current", "voltage", "other"} or unit not in ("", "us", "%")
+    if ("duty" in flags and not of_another) or (unit == "us" and words and {*words} <= _PULSED):
         return Kind.DUTY
     if drive is not None:
         return drive

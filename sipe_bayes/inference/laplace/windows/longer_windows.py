@@ -60,7 +60,7 @@ def led_on(problem: SearchProblem, windows: Windows, state: WindowState) -> Wind
         return tried
     begins = np.stack([trail.states[k][s] for k, s in zip(windows.log, windows.start, strict=True)])
     starts = tangents(windows.simulator.model, begins, windows.reference)
-    starts[:, windows.filters.numbers] = 0.0  # theta and the commands tell
+    windows.filters.follow(starts, windows.number)
     residual, valid = windows.residuals(trail.theta[None], starts[None])
     left = np.sqrt((residual[0] ** 2).sum((0, 1)) / np.maximum(windows.observed.sum((0, 1)), 1))
     if not valid[0] or not np.log(left / best.sd).mean() < np.log(tuning.better):

@@ -65,6 +65,7 @@ def _earlier(windows: Windows, own: IntArray, sensing: Sequence[Sensing]) -> Flo
             earlier = estimate_states(simulator, replace(log, observations=known))
             begin = earlier[windows.start[own]]
             out[late.tobytes()] = tangents(simulator.model, begin, windows.reference[own])
+            out[late.tobytes()][:, windows.filters.numbers] = 0.0  # no sensor tells of a filter of commands
         out.setdefault(late.tobytes(), windows.no_starts()[own])
     return np.stack([out[(one.delay + one.filter).tobytes()] for one in sensing])
 
