@@ -7,6 +7,7 @@ a lag costs its windows nothing but the first. Before the log its first command 
 
 Deviations:
 
+- Filters that firmware steps by its own clock are not followed: each window's is unknown, about the last command.
 - What is left of the log's beginning does not know a filter's limits.
 - Where MuJoCo integrates by RK4, a late command is taken as it is where a physics step begins.
 """
@@ -23,6 +24,7 @@ import scipy.signal
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.internal.states import filtered_commands, kept_by_filter
+from sipe_bayes.envs.laws.firmware import firmware_of
 from sipe_bayes.simulation.simulator import Simulator
 
 
@@ -58,7 +60,8 @@ class FilterStarts:
         known: BoolArray | bool,
     ) -> None:
         model, environment = simulator.model, simulator.environment
-        self._filters = [] if np.all(known) else filtered_commands(model)
+        sampled = {one.actuator for one in firmware_of(model)}  # these act once a tick
+        self._filters = [] if np.all(known) else [one for one in filtered_commands(model) if one[0] not in sampled]
         self._model = copy.copy(model) if self._filters else model
         self._environment, self._space = environment, simulator.space
         self._log, self._start, self._known = log, start, np.broadcast_to(known, len(log))
@@ -94,9 +97,8 @@ class FilterStarts:
         if not self._filters:
             return states
         model, values, numbers = self._model, self._space.values(theta), self.numbers
-        done = dict[
-            tuple[int, int, float, float], tuple[FloatArray, FloatArray]
-        ]()  # no target writes a filter's limits
+        # no target writes a filter's limits
+        done: dict[tuple[int, int, float, float], tuple[FloatArray, FloatArray]] = {}
         for k in np.unique(self._log[windows]).tolist():
             own = np.flatnonzero((self._log[windows] == k) & ~self._known[windows])
             for b in range(len(states)):
