@@ -44,6 +44,7 @@ from sipe_bayes.posterior.storage import ready_arviz
 class ImportanceTuning(Options):
     """When draws take the normal's place, how they are drawn, and when they are enough."""
 
+    wanted: bool = option(True, "whether an optimum's normal is held against the posterior, and draws take its place")
     probe: float = option(2.0, "how far from the optimum the log posterior is looked at", "sd", above=0)
     slack: float = option(0.5, "by which falls of the log posterior may differ for rounding's sake", "nats", least=0)
     least_fall: float = option(0.6, "a fall, over that of the normal, with which it stands", above=0, below=1)

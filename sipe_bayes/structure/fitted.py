@@ -12,6 +12,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.inference.importance import ImportanceTuning
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.options import LaplaceTuning, WindowTuning
 from sipe_bayes.inference.laplace.strategy import distinct
@@ -225,7 +226,7 @@ class Fitting:
     ) -> _Optimum:
         """The best optimum of some logs."""
         given = None if initial is None else initial[None]
-        tuning = LaplaceTuning(windows=_COARSE)
+        tuning = LaplaceTuning(windows=_COARSE, importance=ImportanceTuning(wanted=False))  # it takes the optimum alone
         laplace = Laplace(
             simulator,
             prior=prior,

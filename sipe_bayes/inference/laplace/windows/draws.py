@@ -75,6 +75,8 @@ def probed(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) ->
     kept: the distinct ones, best first.
     """
     best, tuning, n = kept[0], problem.options.tuning.importance, len(problem.space)
+    if not tuning.wanted:
+        return Probe()
     if not isinstance(best, WindowOptimum) or best.guessed or windows.settings.noise == "sandwich":
         return Probe()
     shared = sharing(kept, problem)
