@@ -224,12 +224,8 @@ def _duty(match: Match, actuator: Actuator, table: Table) -> Reading:
     values = table[match.column]
     largest, whole = float(np.nanmax(np.abs(values))), bool((np.mod(values[np.isfinite(values)], 1) == 0).all())
     full = next((f for f in _FULL_DUTIES if largest <= 1.005 * f and (whole or f in _SHARES)), largest)
-    unit, factor, zero, size = (
-        "1",
-        1.0 if full == 1 else float(f"{1 / full:.6g}"),
-        0.0,
-        f"at most {largest:g} of {full:g}",
-    )
+    unit, zero, factor = "1", 0.0, 1.0 if full == 1 else float(f"{1 / full:.6g}")
+    size = f"at most {largest:g} of {full:g}"
     if match.label.unit == "%" or full == _SHARES[1]:
         unit, factor = "%", 1.0
     elif (pulse := _pulse(values, actuator, match.label)) and actuator.drive in _SHARED:

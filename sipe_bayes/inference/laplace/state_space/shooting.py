@@ -160,10 +160,8 @@ def _best_starts(windows: Windows, theta: FloatArray, states: list[FloatArray]) 
 def _simulated(chain: Chain, windows: Windows, here: Position) -> tuple[FloatArray, float]:
     """The chain's states (K, S) on the windows' simulations, and the worst channel's residual in noise sds."""
     windows.spend(1)
-    thetas, begin = (
-        np.tile(here.theta, (windows.num_windows, 1)),
-        windows.states(here.theta[None], here.starts[None])[0],
-    )
+    thetas = np.tile(here.theta, (windows.num_windows, 1))
+    begin = windows.states(here.theta[None], here.starts[None])[0]
     rollout = chain.simulator.rollout(thetas, windows.actions, begin, windows.dt, windows.names, goals=windows.goals)
     assert rollout.states is not None
     residual, valid = windows.residuals(here.theta[None], here.starts[None])

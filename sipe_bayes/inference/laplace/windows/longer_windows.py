@@ -95,10 +95,8 @@ def trailed(
     if not optima:
         return None, spent
     best = max(optima, key=lambda one: one.evidence)
-    thetas, begin = (
-        np.tile(best.theta, (windows.num_windows, 1)),
-        windows.states(best.theta[None], best.starts[None])[0],
-    )
+    thetas = np.tile(best.theta, (windows.num_windows, 1))
+    begin = windows.states(best.theta[None], best.starts[None])[0]
     rollout = simulator.rollout(thetas, windows.actions, begin, windows.dt, windows.names, goals=windows.goals)
     assert rollout.states is not None
     states = [np.full((len(one) + 1, begin.shape[1]), np.nan) for one in logs]
