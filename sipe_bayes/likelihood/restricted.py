@@ -31,6 +31,8 @@ class Pulls:
         start_pull: (W, D), its negative gradient.
         free: (N,), parameters that may move. One held at a bound against its pull is no unknown of the linear model:
             with it the residuals would be credited with an optimum that is not allowed.
+        held: whether the residuals are credited with no optimum at all but taken as they are, since no simulation
+            follows the linear model to it.
     """
 
     prior: FloatArray
@@ -38,6 +40,7 @@ class Pulls:
     start_precision: FloatArray
     start_pull: FloatArray
     free: BoolArray
+    held: bool = False
 
 
 def eliminate_starts(
@@ -95,12 +98,14 @@ def restricted(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, Flo
 
     Returns:
         The value; best step (N,) and covariance (N, N) of theta, zero where it may not move; the starts eliminated.
+        Held, the step is zero and the value lacks what it would gain.
     """
     normal = moments.normal(noise)
     solved = eliminate_starts(normal, moments.num_theta, pulls.start_precision, pulls.start_pull)
     square = float(normal[:, -1, -1].sum())
-    value = moments.log_determinant(noise) + solved.log_determinant + square - solved.explained
+    gained = solved.explained
     n = moments.num_theta
+    value = moments.log_determinant(noise) + solved.log_determinant + square
     move, covariance = np.zeros(n), np.zeros((n, n))
     if pulls.free.any():
         free = np.ix_(pulls.free, pulls.free)
@@ -109,9 +114,12 @@ def restricted(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, Flo
         factor = np.linalg.cholesky(precision + 1e-12 * np.diag(np.diag(precision)))
         inverse = np.linalg.inv(factor)
         half = inverse @ (solved.gradient + pulls.prior_pull)[pulls.free]
-        value += 2 * float(np.log(np.diag(factor)).sum()) - float(half @ half)
+        value += 2 * float(np.log(np.diag(factor)).sum())
+        gained += float(half @ half)
         move[pulls.free], covariance[free] = inverse.T @ half, inverse.T @ inverse
-    return -0.5 * value, move, covariance, solved
+    if pulls.held:
+        return -0.5 * value, np.zeros(n), covariance, solved
+    return -0.5 * (value - gained), move, covariance, solved
 
 
 def restricted_slopes(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, FloatArray, FloatArray]:
@@ -129,7 +137,8 @@ def restricted_slopes(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[flo
     v[:, :n], v[:, -1] = move, -1.0
     inner = np.zeros((windows, size + 1, size + 1))
     if d:
-        slope, starts = solved.slope, solved.blocks(move)
+        slope = solved.slope
+        starts = np.zeros(slope.shape[:2]) if pulls.held else solved.blocks(move)
         by_start[:, n : n + d], by_start[1:, n + d :] = -slope, -slope[:-1]
         v[:, n : n + d], v[1:, n + d : size] = starts, starts[:-1]
         same, apart = solved.covariances()

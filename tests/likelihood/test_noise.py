@@ -205,18 +205,20 @@ def test_elimination_is_the_schur_complement(name: str, noise: Noise, damping: f
 @ALL
 @EVERY_NOISE
 @pytest.mark.parametrize("free", [(True, True, True), (True, False, True), (False, False, False)])
-def test_restricted_likelihood_is_the_dense_one(name: str, noise: Noise, free: tuple[bool, ...]) -> None:
+@pytest.mark.parametrize("held", [False, True])
+def test_restricted_likelihood_is_the_dense_one(name: str, noise: Noise, free: tuple[bool, ...], held: bool) -> None:
+    """Held, it lacks what the linear model would still gain."""
     case, rng = PROBLEMS[name], np.random.default_rng(2)
     pull, prior_pull = rng.normal(size=(len(case.log), D)), rng.normal(size=N)
     root = rng.normal(size=(N, N))
     prior, moving = root @ root.T + 0.1 * np.eye(N), np.array(free)
-    pulls = Pulls(prior, prior_pull, PRECISION, pull, moving)
+    pulls = Pulls(prior, prior_pull, PRECISION, pull, moving, held)
     matrix, right, log_covariance, square = system(case, noise, PRECISION, pull)
     matrix[:N, :N] += prior
     right[:N] += prior_pull
     unknown = np.concatenate([np.flatnonzero(moving), np.arange(N, len(matrix))])
     matrix, right = matrix[np.ix_(unknown, unknown)], right[unknown]
-    explained = right @ np.linalg.solve(matrix, right)
+    explained = 0.0 if held else right @ np.linalg.solve(matrix, right)
     expected = -0.5 * (log_covariance + np.linalg.slogdet(matrix)[1] + square - explained)
     close(restricted(case.moments(), noise, pulls)[0], expected)
 

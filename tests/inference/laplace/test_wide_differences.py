@@ -12,7 +12,8 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.options import LaplaceOptions, LaplaceTuning, WideDifferenceTuning
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.inference.laplace.windows.optimum import Ending, summarised, widened
+from sipe_bayes.inference.laplace.windows.energy import updated_noise
+from sipe_bayes.inference.laplace.windows.optimum import Ending, judged, summarised, widened
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
@@ -34,7 +35,7 @@ def fitted() -> tuple[Laplace, Windows, Ending]:
     moments = windows.moments(lin, white=True)
     noise = Noise(best.sd, best.tau)
     parts = (best.theta, best.starts, noise, moments, lin.residual, lin.jacobian, best.theta, 5, 1.0, 0.0)
-    return method, windows, Ending(*parts, settled=True, cut_short=False, bettered=None)
+    return method, windows, Ending(*parts, tells=True, settled=True, cut_short=False, bettered=None)
 
 
 def jumpy(windows: Windows, ending: Ending, size: float) -> Ending:
@@ -76,3 +77,26 @@ def test_one_that_is_left_narrow_is_said(fitted: tuple[Laplace, Windows, Ending]
     assert wide.finding is not None
     assert wide.finding.code is Code.NOT_SMOOTH
     assert wide.unsmooth
+
+
+def test_what_no_simulation_keeps_counts_neither_for_the_noise_nor_for_the_optimum(
+    fitted: tuple[Laplace, Windows, Ending],
+) -> None:
+    """A slope along the residuals, which promises to explain them all, as at a kink of dry friction."""
+    method, windows, ending = fitted
+    jacobian = ending.jacobian.copy()
+    jacobian[..., 0] = np.abs(jacobian[..., 0]).mean() / ending.noise.sd * ending.residual
+    moments = windows.moments(replace(windows.linearise(ending.theta, ending.starts), jacobian=jacobian), white=True)
+    promising = replace(ending, jacobian=jacobian, moments=moments)
+    at, prior = (ending.noise, ending.theta, ending.starts), method.problem.quadratic_prior
+    size = float(np.sqrt((ending.residual[windows.observed] ** 2).mean()))
+    believed, held = (updated_noise(windows, moments, *at, prior, False, held).sd[0] / size for held in (False, True))
+    print(believed, held)
+    assert believed < 0.2
+    assert 1.0 <= held < 1.1
+
+    kept, broken = (summarised(method.problem, windows, replace(promising, refused=r)) for r in (0.0, 100.0))
+    assert kept.evidence > broken.evidence + 100.0
+    judgement = judged(method.problem, windows, broken, None, replace(promising, refused=100.0))
+    assert judgement.unsmooth
+    assert (judgement.mean == ending.theta).all()

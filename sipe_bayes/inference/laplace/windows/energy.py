@@ -81,8 +81,15 @@ class LinearisedWindows:
         return point, self.of(theta, starts, residual[0]) if valid[0] else np.inf
 
 
-def pulls(windows: Windows, prior: QuadraticPrior, theta: FloatArray, starts: FloatArray, force: FloatArray) -> Pulls:
-    """Priors and bounds at theta (N,) and starts (W, D).
+def pulls(
+    windows: Windows,
+    prior: QuadraticPrior,
+    theta: FloatArray,
+    starts: FloatArray,
+    force: FloatArray,
+    held: bool = False,
+) -> Pulls:
+    """Priors and bounds at theta (N,) and starts (W, D); held as ``Pulls`` has it.
 
     force (N,): that of the data on theta, which may press it against a bound.
     """
@@ -90,7 +97,7 @@ def pulls(windows: Windows, prior: QuadraticPrior, theta: FloatArray, starts: Fl
     flat = FLAT_PRECISION * np.eye(len(theta))
     start_pull = -windows.start_precision * starts
     free = free_to_move(theta, force + pull)
-    return Pulls(prior.precision + flat, pull, windows.start_precision, start_pull, free)
+    return Pulls(prior.precision + flat, pull, windows.start_precision, start_pull, free, held)
 
 
 def present_noise(windows: Windows, residual: FloatArray) -> Noise:
@@ -116,14 +123,16 @@ def updated_noise(
     starts: FloatArray,
     prior: QuadraticPrior,
     coloured: bool,
+    held: bool,
 ) -> Noise:
     """Noise that maximises the restricted likelihood of one linearisation, at theta (N,) and starts (W, D).
 
-    The search for it begins at ``before``; coloured: whether correlation times are estimated.
+    The search for it begins at ``before``; coloured: whether correlation times are estimated; held: whether the
+    linearisation promises what no simulation keeps.
     """
     start_pull = -windows.start_precision * starts
     solved = eliminate_starts(moments.normal(before), moments.num_theta, windows.start_precision, start_pull)
-    context = pulls(windows, prior, theta, starts, solved.gradient)
+    context = pulls(windows, prior, theta, starts, solved.gradient, held)
     noise = estimated(windows, moments, before, context, coloured)
     sd = np.where(np.isnan(windows.fixed_sd), np.maximum(noise.sd, windows.rounding), noise.sd)
     return Noise(sd, noise.tau)

@@ -52,6 +52,7 @@ class Ending:
         steps: from there.
         first_misfit: of the residuals at the starting point, in units of the channels' spread.
         refused: nats that the last steps were to gain, none of which gained anything.
+        tells: whether that is something to be said: not where differences are long, or the surroundings are looked at.
         settled: whether nothing moved any more.
         cut_short: whether the budget ends.
         bettered: the optimum before, from which a pattern search led here; this one is to be no narrower.
@@ -67,9 +68,15 @@ class Ending:
     steps: int
     first_misfit: float
     refused: float
+    tells: bool
     settled: bool
     cut_short: bool
     bettered: WindowOptimum | None
+
+
+def is_broken(problem: SearchProblem, windows: Windows, refused: float) -> bool:
+    """Whether nats that steps of theta and the starts were to gain, none of which did, are more than rounding."""
+    return windows.num_start > 0 and refused > problem.options.tuning.windows.most_drift
 
 
 def summarised(problem: SearchProblem, windows: Windows, ending: Ending) -> WindowOptimum:
@@ -77,12 +84,13 @@ def summarised(problem: SearchProblem, windows: Windows, ending: Ending) -> Wind
     theta, starts, noise, moments = ending.theta, ending.starts, ending.noise, ending.moments
     prior, start_pull, sandwiched = problem.quadratic_prior, -windows.start_precision * starts, sandwiches(windows)
     solved = eliminate_starts(moments.normal(noise), moments.num_theta, windows.start_precision, start_pull)
-    here = pulls(windows, prior, theta, starts, solved.gradient)
+    held = is_broken(problem, windows, ending.refused)
+    here = pulls(windows, prior, theta, starts, solved.gradient, held)
     prior_energy = prior.energy(theta) + 0.5 * float((starts**2 @ windows.start_precision).sum())
     evidence = restricted(moments, noise, replace(here, free=np.full(len(theta), True)))[0] - prior_energy
     white = noise.sd
     if sandwiched:
-        noise = updated_noise(windows, moments, noise, theta, starts, prior, coloured=True)
+        noise = updated_noise(windows, moments, noise, theta, starts, prior, coloured=True, held=held)
     mean, covariance = np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
     centres = []
     # moments of the normals of a few weighted noise values
@@ -196,14 +204,16 @@ def judged(
 
     ``around`` is None where they were not looked at.
     """
-    unsmooth, covariance = ending.refused > problem.options.tuning.windows.most_drift, optimum.covariance
-    reason = optimum.finding
+    most, covariance, reason = problem.options.tuning.windows.most_drift, optimum.covariance, optimum.finding
+    unsmooth, gain, off = ending.tells and ending.refused > most, ending.refused, optimum.mean - ending.theta
+    if sandwiches(windows):  # in nats of its own width
+        gain = 0.5 * float(off @ np.linalg.pinv(covariance, hermitian=True) @ off)
     if ending.cut_short and not ending.settled:
         reason = finding(Code.SEARCH_CUT_SHORT)
     elif not ending.settled:
         reason = finding(Code.SEARCH_UNSETTLED, steps=ending.steps)
-    elif unsmooth:
-        reason = finding(Code.NOT_SMOOTH, gain=ending.refused)
+    elif unsmooth and gain > most:
+        reason = finding(Code.NOT_SMOOTH, gain=gain)
     elif (times := beyond_start_noise(windows, optimum.sd)) is not None:
         reason = finding(Code.BEYOND_START_NOISE, times=times)
     if around is not None:
@@ -219,7 +229,7 @@ def judged(
         left = misfit(windows, ending.residual) / ending.first_misfit
         way = float(np.sqrt(((ending.theta - ending.begin) ** 2).mean()))
         covariance = covariance + (way * min(1.0, left)) ** 2 * np.eye(len(ending.theta))
-    if windows.num_start and unsmooth:
+    if is_broken(problem, windows, ending.refused):
         # the normal's middle lies where a slope led that no simulation follows
         refused = np.clip(optimum.mean, 0.0, 1.0) - ending.theta
         optimum, covariance = replace(optimum, mean=ending.theta), covariance + np.outer(refused, refused)

@@ -64,6 +64,7 @@ from sipe_bayes.inference.laplace.windows.growing_windows import (
 )
 from sipe_bayes.inference.laplace.windows.optimum import (
     Ending,
+    is_broken,
     judged,
     middle_of_ridge,
     sandwiches,
@@ -258,8 +259,8 @@ class WindowSearch:
         windows, here = self.windows, state.here
         lin, stale, drift = self._linearise(here)
         moments, coloured = windows.moments(lin, white=self._white), windows.settings.noise == "ar1"
-        prior = self.problem.quadratic_prior
-        noise = updated_noise(windows, moments, here.noise, here.theta, here.starts, prior, coloured)
+        at, prior = (here.noise, here.theta, here.starts), self.problem.quadratic_prior
+        noise = updated_noise(windows, moments, *at, prior, coloured, is_broken(self.problem, windows, here.refused))
         step, converged = self._stepped(state, lin, moments, noise, stale, drift)
         # where theta does not move for the noise that is best there, both are
         settled = converged and (not step.fit.gained or same_noise(noise, here.noise))
@@ -291,9 +292,8 @@ class WindowSearch:
         tolerance = tuning.tolerance
         if here.phase in _ROUGH:
             tolerance = max(tuning.rough_tolerance * linearised.energy, tolerance)
-        cut_short = False
         try:
-            fit = descend(linearised, here.damping, tolerance, self._tuning.damping, stale)
+            fit, cut_short = descend(linearised, here.damping, tolerance, self._tuning.damping, stale), False
         except BudgetExhausted:
             if state.optima:  # else the budget leaves room for one
                 raise
@@ -316,6 +316,7 @@ class WindowSearch:
             damping=fit.damping,
             iteration=here.iteration + 1,
             misfit=here.misfit or misfit(windows, lin.residual),
+            refused=fit.refused,
             kept=kept,
         )
         return Step(lin, moments, noise, fit, after, cut_short), converged
@@ -336,10 +337,8 @@ class WindowSearch:
 
         ``state`` is that after the last step, ``before`` where this was linearised, which is the optimum.
         """
-        windows, tuning, here = self.windows, self._tuning, state.here
-        theta, noise = before.theta, step.noise
+        windows, tuning, here, theta, noise = self.windows, self._tuning, state.here, before.theta, step.noise
         moments = windows.moments(step.lin) if before.phase in _ROUGH and not self._white else step.moments
-        tells = bool(windows.num_start) and not windows.least_steps(theta).any()  # else points around, or a secant
         ending = Ending(
             theta,
             before.starts,
@@ -350,31 +349,32 @@ class WindowSearch:
             begin=state.points[state.point],
             steps=here.iteration,
             first_misfit=here.misfit,
-            refused=step.fit.refused if tells or step.fit.exhausted else 0.0,
+            refused=step.fit.refused,
+            tells=step.fit.exhausted or bool(windows.num_start and not windows.least_steps(theta).any()),
             settled=settled,
             cut_short=cut_short,
             bettered=state.optima[-1] if here.patterns else None,
         )
         optimum = widened(self.problem, windows, ending)
-        centred = here.centred or cut_short
-        further = None if centred else middle_of_ridge(self.problem, windows, optimum)
+        afresh, stays = here.afresh(tuning.damping), here.centred or cut_short
+        further = None if stays else middle_of_ridge(self.problem, windows, optimum)
         if further is not None:
-            return replace(state, here=replace(here.afresh(tuning.damping), theta=further, centred=True))
+            return replace(state, here=replace(afresh, theta=further, centred=True))
         searched = Noise(noise.sd, np.zeros(len(noise.sd))) if sandwiches(windows) else noise
         around = surroundings(self.problem, windows, theta, searched, optimum.covariance)
         optimum = judged(self.problem, windows, optimum, around, ending)
         # one that is searched on from is none
         optima = (*state.optima[: len(state.optima) - here.revisits], optimum)
         state = replace(state, optima=optima)
-        if not here.long and windows.least_steps(theta).any():
-            return replace(state, here=replace(here.afresh(tuning.damping), long=True, iteration=0))
+        if windows.least_steps(theta).any() and not here.long:
+            return replace(state, here=replace(afresh, long=True, iteration=0))
         if around is not None and around.other is not None and len(state.points) < tuning.windows.most_points:
             state = replace(state, points=np.concatenate([state.points, around.other[None]]))
         if around is None or around.better is None or here.patterns >= tuning.windows.most_patterns:
             return self._next(state)
         size = min(here.theta_step, max(float(np.abs(around.better - theta).max()), SHORTEST))
-        better = replace(here.afresh(tuning.damping), theta=around.better, theta_step=size, iteration=0)
-        return replace(state, here=replace(better, patterns=here.patterns + 1))
+        better = replace(afresh, theta=around.better, theta_step=size, iteration=0, patterns=here.patterns + 1)
+        return replace(state, here=better)
 
     def _begin(self, theta: FloatArray, subset: bool = True) -> Position:
         """At a starting point theta (N,); subset: whether every other window may be tried first."""

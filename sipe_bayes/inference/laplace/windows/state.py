@@ -67,6 +67,7 @@ class Position:
         iteration: steps until now; a new optimum begins again at zero.
         misfit: of the first residuals, in units of the channels' spread; zero before them.
         theta_step: of the finite differences, at most.
+        refused: nats that the last linearisation promised and no simulation kept.
         kept: what spares simulations.
         centred: whether the search has gone to the middle of a ridge.
         long: whether differences are as long as the environment asks for.
@@ -86,6 +87,7 @@ class Position:
     theta_step: float
     iteration: int = 0
     misfit: float = 0.0
+    refused: float = 0.0
     kept: Kept = field(default_factory=Kept)
     centred: bool = False
     long: bool = False
