@@ -2,7 +2,8 @@
 
 Where the plain model leaves much of a channel unexplained, each channel that moves and each command is multiplied by
 -1, 180 / pi, 1000 and their inverses, and the model fitted again, the least explained columns first and signs before
-units, as far as a share of the budget goes. For a channel y, p(y) = |f|^n p(f y), n its samples.
+units, as far as a share of the budget goes. A factor is only right where with it the channel is explained. For a
+channel y, p(y) = |f|^n p(f y), n its samples that are fitted.
 """
 
 from __future__ import annotations
@@ -62,10 +63,31 @@ def moving(windows: Windows) -> BoolArray:
     return np.asarray(windows.spread**2 > noise**2 * (1 + np.maximum(chance, 0.2)))
 
 
-def unexplained(windows: Windows, sd: FloatArray, shown: BoolArray) -> dict[str, float]:
-    """The share of a channel's spread that the residuals' sd (C,) is, by name of those that are ``shown`` to move."""
+def unexplained(windows: Windows, sd: FloatArray, shown: BoolArray, column: Column | None = None) -> dict[str, float]:
+    """The share of a channel's spread that the residuals' sd (C,) is, by name of those that are ``shown`` to move.
+
+    column: that was corrected where the residuals are of logs that ``windows`` have as they were.
+    """
+    own = [column is not None and not column.command and column.name == name for name in windows.fitted]
+    spread = windows.spread * np.where(own, 1.0 if column is None else abs(column.factor), 1.0)
     names = np.array(windows.fitted)[shown].tolist()
-    return dict(zip(names, (sd[shown] / windows.spread[shown]).tolist(), strict=True))
+    return dict(zip(names, (sd[shown] / spread[shown]).tolist(), strict=True))
+
+
+def told_by(environment: MjcfEnvironment, name: str, command: bool, share: Mapping[str, float]) -> float:
+    """The largest share among the channels that tell a column, of a command those of the joint that it drives."""
+    if not command:
+        return share.get(name, 0.0)
+    model, targets = environment.compile(), {c.label: c.target for c in environment.measurements}
+    joint = driven_joint(model, model.actuator(name).id)
+    site = f"joint:{model.joint(joint).name}." if joint >= 0 else None
+    own = [left for channel, left in share.items() if site is not None and targets[channel].startswith(site)]
+    return max(own or share.values(), default=0.0)
+
+
+def is_explained(environment: MjcfEnvironment, share: Mapping[str, float], column: Column, most: float) -> bool:
+    """Whether with a column corrected no more than ``most`` is left of the channels that tell it."""
+    return told_by(environment, column.name, column.command, share) < most
 
 
 def choices(environment: MjcfEnvironment, share: Mapping[str, float]) -> list[Column]:
@@ -78,13 +100,8 @@ def choices(environment: MjcfEnvironment, share: Mapping[str, float]) -> list[Co
         environment: whose columns.
         share: of each channel that may be wrong, how much of its spread is unexplained.
     """
-    model, targets = environment.compile(), {c.label: c.target for c in environment.measurements}
-    promise = {(name, False): left for name, left in share.items()}
-    for actuator in environment.actuators:
-        joint = driven_joint(model, model.actuator(actuator).id)
-        site = f"joint:{model.joint(joint).name}." if joint >= 0 else None
-        own = [left for name, left in share.items() if site is not None and targets[name].startswith(site)]
-        promise[actuator, True] = max(own or share.values(), default=0.0)
+    columns = [*((name, False) for name in share), *((name, True) for name in environment.actuators)]
+    promise = {column: told_by(environment, *column, share) for column in columns}
     ranked = enumerate(sorted(promise, key=lambda column: -promise[column]))
     every = [(rank + k, Column(*column, factor)) for rank, column in ranked for k, factor in enumerate(FACTORS)]
     return [column for _, column in sorted(every, key=lambda item: item[0])]
@@ -101,11 +118,12 @@ def corrected(logs: Trajectories, columns: Sequence[Column], actuators: Sequence
     return replace(logs, observations=observations, actions=actions)
 
 
-def log_jacobian(logs: Trajectories, columns: Sequence[Column]) -> float:
-    """Log of the density of the logs over that of the corrected ones: n log |f| of every channel."""
-    total = 0.0
-    for column in columns:
-        if not column.command:
-            samples = logs.observations[..., list(logs.channels).index(column.name)]
-            total += int(np.isfinite(samples).sum()) * math.log(abs(column.factor))
-    return total
+def log_jacobian(windows: Windows, column: Column) -> float:
+    """Log of the density of a channel as given over that of the corrected one, n log |f| of n samples that are fitted.
+
+    Of long logs these are not all (``Segments.seconds``).
+    """
+    if column.command or column.name not in windows.fitted:
+        return 0.0
+    samples = windows.observed[..., list(windows.fitted).index(column.name)]
+    return int(samples.sum()) * math.log(abs(column.factor))

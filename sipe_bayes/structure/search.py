@@ -42,7 +42,7 @@ from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.structure.candidates import Candidate, candidates, first
-from sipe_bayes.structure.columns import Column, choices, log_jacobian, moving, unexplained
+from sipe_bayes.structure.columns import Column, choices, is_explained, log_jacobian, moving, unexplained
 from sipe_bayes.structure.extension import Extension, Placed, members, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
 from sipe_bayes.structure.machine import Machine, machine_of
@@ -193,9 +193,8 @@ class StructureSearch:
         """The column whose factor makes the plain model fit far better, if any does."""
         given, plain, options = self.given, state.fitted[0] if state.fitted else None, self.options
         state, share = replace(state, phase=Phase.RANK), dict.fromkeys(given.environment.channels, 0.0)
+        shown = moving(windows := given.windows(given.simulator([])))
         if plain is not None:
-            windows = given.windows(given.simulator([]))
-            shown = moving(windows)
             left = unexplained(windows, plain.sd, shown)
             if max(left.values(), default=0.0) < options.gross:
                 return state
@@ -209,9 +208,9 @@ class StructureSearch:
             self._doing = f"{self.describe(replace(state, phase=Phase.COLUMNS))}, {number} of {len(columns)}"
             one, rollouts = self._try([column], options.column_budget)
             spent += rollouts
-            if one is not None:
-                as_given = one.evidence + log_jacobian(given.trajectories, [column])
-                tried.append((as_given, column, one))
+            after = {} if one is None else unexplained(windows, one.sd, shown, column)
+            if one is not None and (plain is None or is_explained(given.environment, after, column, options.gross)):
+                tried.append((one.evidence + log_jacobian(windows, column), column, one))
         if plain is None and not tried:
             given.fit([], None, self.enough([]))  # raises what keeps the plain model from being fitted
         best = max(tried, key=lambda item: item[0], default=None)

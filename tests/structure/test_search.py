@@ -15,7 +15,7 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood.settings import BudgetTooSmall, Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.structure import DiscoverOptions, Extension, Restriction, Structures, discover
-from sipe_bayes.structure.columns import Column, choices, moving, unexplained
+from sipe_bayes.structure.columns import Column, choices, log_jacobian, moving, unexplained
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.machine import Machine
 from sipe_bayes.structure.state import DiscoverState, Phase
@@ -258,6 +258,25 @@ def test_a_long_log_is_searched_on_blocks_of_it() -> None:
     windows = structures.search.fitting.windows(structures.simulator(structures.plain))
     assert (windows.steps * windows.dt).sum() == pytest.approx(half, rel=0.15)
     assert structures.best.labels == ("dry_friction:hinge",)
+
+
+def test_a_unit_is_judged_by_the_samples_that_are_fitted_alone() -> None:
+    """The fit leaves most of a long log out, and the plain model follows nothing: no unit is to blame for that."""
+    gravity = Parameter("spring", 0.0, 30.0, targets=("joint:hinge.stiffness",))
+    recorded = log(pendulum(gravity), [0.6, 0.02, 25.0], 8, steps=2000)
+    structures = discover(
+        pendulum(),
+        Trajectories.stack([recorded]),
+        restriction=Restriction(only=("dry_friction",)),
+        options=DiscoverOptions(physics_steps=200),
+    )
+    windows = structures.search.given.windows(structures.search.given.simulator([]))
+    (name,) = windows.fitted
+    assert max(unexplained(windows, structures.plain.sd, moving(windows)).values()) > structures.search.options.gross
+    assert structures.columns == ()
+    few = log_jacobian(windows, Column(name, False, 1000.0)) / np.log(1000.0)
+    assert few == pytest.approx(200, rel=0.2)
+    assert log_jacobian(windows, Column("motor", True, 1000.0)) == 0.0
 
 
 def test_a_larger_budget_begins_anew_where_the_smaller_one_told_the_beginning_short() -> None:
