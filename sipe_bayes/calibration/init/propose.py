@@ -13,7 +13,8 @@ import numpy as np
 from sipe_bayes.calibration.init.absolute import absolute_angles, with_zeros
 from sipe_bayes.calibration.init.columns.match import Match, Matches
 from sipe_bayes.calibration.init.columns.matching import match_columns
-from sipe_bayes.calibration.init.columns.names import TURNS, pieces_of
+from sipe_bayes.calibration.init.columns.names import pieces_of
+from sipe_bayes.calibration.init.columns.vocabulary import TURNS
 from sipe_bayes.calibration.init.decisions import decide
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading, Unknown
 from sipe_bayes.calibration.init.fits import delay_of, fit
@@ -23,7 +24,7 @@ from sipe_bayes.calibration.init.kinematics.rates import rates_of, with_evidence
 from sipe_bayes.calibration.init.machine import Machine, Sizes, touching_bodies
 from sipe_bayes.calibration.init.ranking import Case, ranked_of, under
 from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
-from sipe_bayes.calibration.init.tables import Opened, richest
+from sipe_bayes.calibration.init.tables import Opened, loads, richest
 from sipe_bayes.calibration.init.trials import Trial
 from sipe_bayes.calibration.init.unknowns.candidates import candidates, scale_is_open, springs
 from sipe_bayes.calibration.init.unknowns.choice import RELATIVE, chosen, roomy, sprung
@@ -95,7 +96,7 @@ def propose(
     lines, sources, dropped = _split(files, opened, measurements, commands, folder)
     draft = Draft(
         _relative(model_path, folder), opened.clock, opened.episodes, commands, measurements, lines, 1e-3,
-        doubts=(*dropped, *matches.doubts, *_unmatched(model, machine, matches, commands)),
+        doubts=(*dropped, *matches.doubts, *loads([opened, *others]), *_unmatched(model, machine, matches, commands)),
         notes=(*_unused(matches, commands), *nameless(model, {model.body(body).id for body in machine.bodies})),
     )  # fmt: skip
     positions = bool(tried_part(draft).measurements)

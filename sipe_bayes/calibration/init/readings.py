@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sipe_bayes.calibration.init.columns.match import Match, Matches
-from sipe_bayes.calibration.init.columns.names import SIDES, Kind, Label, pieces_of, read_name
+from sipe_bayes.calibration.init.columns.names import Kind, Label, pieces_of, read_name
 from sipe_bayes.calibration.init.columns.signals import Slope, likeness, slope_of, turn_of, white_share
+from sipe_bayes.calibration.init.columns.vocabulary import SIDES
 from sipe_bayes.calibration.init.draft import Reading, Scale
 from sipe_bayes.calibration.init.machine import Actuator, Drive, Machine
 from sipe_bayes.calibration.init.shares import with_shares

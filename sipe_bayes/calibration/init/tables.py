@@ -52,12 +52,16 @@ class Clock:
 
 @dataclass(frozen=True)
 class Opened:
-    """A log: its clock, what numbers its episodes, its columns (n,) on one clock, and how long it is in s."""
+    """A log: its clock, what numbers its episodes, its columns (n,) on one clock, and how long it is in s.
+
+    Columns that do not change are none of these; of those in kg, as of a load, ``weights`` has the value.
+    """
 
     clock: Clock
     episodes: str | None
     columns: Mapping[str, FloatArray]
     seconds: float
+    weights: Mapping[str, float]
 
 
 def open_table(path: Path, table: Columns, rate: float | None = None) -> Opened:
@@ -76,7 +80,9 @@ def open_table(path: Path, table: Columns, rate: float | None = None) -> Opened:
     times = [values for name, values in numbers.items() if leaf(name) == clock.column or name == clock.column]
     longest = max(times, key=len)
     seconds = float(longest[-1] - longest[0]) * find_unit(clock.unit).factor
-    return Opened(clock, episodes, _together(numbers, clock, episodes), seconds)
+    rests = {name: float(values[0]) for name, values in numbers.items() if len(values) and (values == values[0]).all()}
+    weights = {name: value for name, value in rests.items() if read_name(leaf(name)).unit == "kg"}
+    return Opened(clock, episodes, _together(numbers, clock, episodes), seconds, weights)
 
 
 def richest(files: Sequence[Path], rate: float | None = None) -> tuple[Opened, list[Opened]]:
@@ -89,6 +95,18 @@ def richest(files: Sequence[Path], rate: float | None = None) -> tuple[Opened, l
     alike = [opened[0], *(one for one in opened[1:] if names.issuperset(one.columns))]
     most = max(alike, key=lambda one: len(one.columns))
     return most, [one for one in opened if one is not most]
+
+
+def loads(opened: Sequence[Opened]) -> list[str]:
+    """What is to be asked of columns that say in kg what a log carries, so that it can be given as a fact."""
+    out = []
+    for name in sorted({name for one in opened for name in one.weights}):
+        values = [one.weights[name] for one in opened if name in one.weights]
+        if any(values):
+            span = " to ".join(f"{value:.4g}" for value in sorted({min(values), max(values)}))
+            entry = '`added = {"body:NAME.mass" = ...}`'
+            out.append(f"{name!r} is {span} kg by log: of a load that the model has not, each log can say it: {entry}")
+    return out
 
 
 def _numbers(column: np.ndarray) -> FloatArray | None:

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from sipe_bayes.calibration.config import load_config
 from sipe_bayes.calibration.init.draft import Draft
 from sipe_bayes.calibration.init.propose import propose
-from sipe_bayes.calibration.init.tables import richest
+from sipe_bayes.calibration.init.tables import loads, richest
 from sipe_bayes.calibration.init.write import summary, toml_of
 from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.cli.app import app
@@ -252,3 +252,16 @@ def test_columns_are_looked_for_in_the_log_in_which_most_of_them_change(tmp_path
     opened, others = richest([tmp_path / f"{name}.csv" for name in ("squat", "trot", "run")])
     assert [*opened.columns] == ["hip", "knee"]
     assert [[*one.columns] for one in others] == [["knee"], ["hip", "knee", "tail"]]
+
+
+def test_a_weight_that_logs_state_is_asked_for(tmp_path: Path) -> None:
+    """It stands still within each log, so that it is no column of motion; none is none."""
+    time = 0.01 * np.arange(50)
+    for name, weight in (("empty", 0.0), ("loaded", 60.0)):
+        columns = {"t": time, "boom": np.sin(time), "payload_kg": weight, "hook_kg": 0.0, "oil": weight}
+        pd.DataFrame(columns).to_csv(tmp_path / f"{name}.csv", index=False)
+    opened, others = richest([tmp_path / "empty.csv", tmp_path / "loaded.csv"])
+    (doubt,) = loads([opened, *others])
+    assert doubt.startswith("'payload_kg' is 0 to 60 kg by log")
+    assert "added" in doubt
+    assert loads([opened]) == []

@@ -14,7 +14,7 @@ from sipe_bayes.calibration.init.fits import Fit, delay_of
 from sipe_bayes.calibration.init.machine import Machine, Sizes
 from sipe_bayes.calibration.init.readings import first_readings
 from sipe_bayes.calibration.init.tables import Clock
-from sipe_bayes.calibration.init.unknowns.candidates import candidates, springs
+from sipe_bayes.calibration.init.unknowns.candidates import candidates, least_of, springs
 from sipe_bayes.calibration.init.unknowns.choice import roomy, sprung, told_apart
 
 
@@ -49,6 +49,7 @@ def test_what_is_nearly_the_same_is_asked_for_where_the_logs_tell_it(
 FILTERED = """<mujoco><option timestep="0.002"/><worldbody><body name="arm"><joint name="hinge" axis="0 1 0"/>
     <geom size=".1" mass="1"/><body name="payload"><geom name="tip" size=".1" mass=".2"/></body></body></worldbody>
     <actuator><general name="drive" joint="hinge" dyntype="filter" dynprm="0.02"/></actuator></mujoco>"""
+SERVO = 'biastype="affine" biasprm="0 0 -5"'
 
 
 @pytest.mark.parametrize(
@@ -171,3 +172,14 @@ def test_thrusters_of_what_slides_and_turns_share_a_gain_that_nothing_tells() ->
     }
     assert {"rotors_gain", "raft_mass"} <= asked
     assert not {"port_gain", "starboard_gain"} & asked
+
+
+def test_the_damping_of_a_velocity_servo_has_no_least_factor() -> None:
+    """It is negative in the model and bounded by nothing below: its factor had none but infinity."""
+    model = mujoco.MjModel.from_xml_string(FILTERED.replace('dyntype="filter" dynprm="0.02"', SERVO))
+    name = model.actuator(0).name
+    unknown = Unknown("servo", (f"actuator:{name}.bias_velocity",), 0.25, 4.0, True, "")
+    assert least_of(model, unknown) == -np.inf
+    kept = roomy(model, unknown, 0.0)
+    assert np.isfinite([kept.low, kept.high]).all()
+    assert 0 < kept.low < 0.25

@@ -10,19 +10,10 @@ import numpy as np
 import scipy.optimize
 
 from sipe_bayes.calibration.init.columns.match import SURE, Match, Matches
-from sipe_bayes.calibration.init.columns.names import (
-    LETTERS,
-    OF_BODIES,
-    Kind,
-    Label,
-    alike,
-    is_exactly,
-    number_of,
-    pieces_of,
-    read_name,
-)
+from sipe_bayes.calibration.init.columns.names import Kind, Label, alike, is_exactly, number_of, pieces_of, read_name
 from sipe_bayes.calibration.init.columns.signals import slope_of
 from sipe_bayes.calibration.init.columns.vectors import held_open, match_vectors
+from sipe_bayes.calibration.init.columns.vocabulary import LETTERS, OF_BODIES
 from sipe_bayes.calibration.init.machine import Actuator, Drive, Joint, Machine
 from sipe_bayes.core.arrays import FloatArray
 

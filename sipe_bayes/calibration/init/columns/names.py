@@ -8,6 +8,36 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from enum import Enum, auto
 
+from sipe_bayes.calibration.init.columns.vocabulary import (
+    ABOUT,
+    ACCELERATIONS,
+    ALONG,
+    ANGLES,
+    CELLS,
+    COMMANDS,
+    CURRENTS,
+    DESIRED,
+    DUTIES,
+    EPISODES,
+    GREEK,
+    LENGTHS,
+    LETTERS,
+    MEASURED,
+    OF_NO_JOINT,
+    OTHERS,
+    PLACES,
+    POSITIONS,
+    PULSED,
+    RATES,
+    SPEEDS,
+    SUPPLIES,
+    TIMES,
+    TORQUES,
+    TURNS,
+    UNITS,
+    VOLTAGES,
+)
+
 
 class Kind(Enum):
     """What a column may be, by its name."""
@@ -61,97 +91,25 @@ class Label:
     commanded: bool = False
 
 
-_GREEK = str.maketrans(
-    {"θ": "theta", "τ": "tau", "ω": "omega", "φ": "phi", "ϕ": "phi", "α": "alpha", "β": "beta", "ψ": "psi", "°": "deg"}
-)
-_ANGLES = {"angle", "angles", "theta", "phi", "alpha", "beta", "gamma", "psi", "th", "ang", "rotation", "heading"}
-_ANGLES |= {"winkel"}
-_LENGTHS = {"x", "y", "z", "displacement", "disp", "distance", "stroke", "travel", "extension", "height"}
-_PLACES = {"position", "positions", "pos", "q", "qpos", "enc", "encoder", "joint_pos", "actual", "present", "s", "p"}
-_PLACES |= {"lage", "stellung"}
-_POSITIONS = _ANGLES | _LENGTHS | _PLACES
-_ALONG, _ABOUT = {"vx", "vy", "vz"}, {"wx", "wy", "wz", "gx", "gy", "gz"}  # velocities of a body
-_PUSHED = {"ax", "ay", "az"}  # accelerations of a body
-OF_BODIES = _ALONG | _ABOUT | _PUSHED
-"""Words with an axis, of velocities and accelerations."""
-_SPEEDS = {"velocity", "velocities", "vel", "speed", "omega", "w", "qvel", "rate", "gyro", "v", "xv", "av"} | {
-    "angvel", "drehzahl", "drehz", "geschwindigkeit",
-} | _ALONG | _ABOUT  # fmt: skip
-_ACCELERATIONS = _PUSHED | {"acceleration", "accelerations", "acc", "accel", "qacc", "ddq", "qdd", "ddot"} | {
-    "accelerometer",
-}  # fmt: skip
-_TORQUES = {"tau", "torque", "torques", "effort", "efforts", "force", "forces", "trq", "f", "moment", "load", "thrust"}
-_TORQUES |= {"drehmoment", "kraft"}
-_COMMANDS = {"cmd", "command", "commands", "commanded", "u", "ctrl", "control", "controls", "action", "actions"} | {
-    "input", "drive", "applied", "a",
-}  # fmt: skip
-_DUTIES = {"pwm", "duty", "dutycycle", "throttle", "rcou", "pulse", "pulsewidth", "esc"}
-_PULSED = {"motor", "rotor", "servo", "prop", "thruster"}  # in microseconds
-_SUPPLIES = {"battery", "batt", "vbat", "vbatt", "supply", "vbus", "vdc", "vcc", "vin"}
-_DESIRED = {"des", "desired", "ref", "reference", "setpoint", "sp", "set", "target", "goal", "demand", "wanted"} | {
-    "requested", "dem", "soll", "sollwert",
-}  # fmt: skip
-_MEASURED = {
-    "meas",
-    "measured",
-    "actual",
-    "act",
-    "present",
-    "est",
-    "estimated",
-    "observed",
-    "observation",
-    "filtered",
-    "sens",
-    "ist",
-    "istwert",
-}
-_CURRENTS = {"current", "currents", "amps", "ampere", "cur", "iq", "i", "strom"}
-_VOLTAGES = {"voltage", "voltages", "volt", "volts", "spannung"}
-_TIMES = {"time", "t", "timestamp", "timestamps", "stamp", "clock", "elapsed", "seconds", "secs", "millis"} | {
-    "micros", "nanos", "tick", "ticks", "timestep", "sec", "zeit",
-}  # fmt: skip
-_EPISODES = {"episode", "trial", "rollout", "demo", "toss", "experiment", "ep", "traj", "trajectory"}
-LETTERS = {"a", "f", "i", "n", "u", "v"}
-"""Words of one letter, of commands, currents and units, that may also be a joint's: A1, axisA."""
-_OTHERS = {"temp", "temperature", "flag", "error", "err", "status", "mode", "index", "frame", "id", "reward"} | {
-    "done", "task", "count", "seq", "step", "contact", "success", "residual", "power", "energy", "noise",
-    "humidity", "pressure", "rssi", "sonar", "lidar", "ultrasonic", "fault", "warning", "health",
-}  # fmt: skip
-_CELLS = {"cell", "cells"}  # of a battery: their voltages drive nothing
-TURNS = {"cos", "sin", "cosine", "sine"}  # of an angle, as a resolver tells it
-SIDES = {"left", "right", "front", "rear", "back", "hind", "fore", "middle", "mid", "l", "r"}
-SIDES |= {a + b for a in "frhbm" for b in "lr"} | {a + b for a in "lr" for b in "frhbm"}
-"""Words of a name that only say on which side, or at which leg, something is."""
-_UNITS = {
-    "rad": "rad", "rads": "rad", "radian": "rad", "radians": "rad", "deg": "deg", "degs": "deg", "degree": "deg",
-    "degrees": "deg", "mrad": "mrad", "rev": "rev", "revs": "rev", "turns": "rev", "rpm": "rpm", "dps": "deg/s",
-    "radps": "rad/s", "degps": "deg/s", "mps": "m/s", "mmps": "mm/s", "rps": "rev/s", "mm": "mm", "cm": "cm",
-    "um": "um", "meter": "m", "meters": "m", "metre": "m", "nm": "N m", "mnm": "mN m", "newton": "N", "newtons": "N",
-    "mn": "mN", "kn": "kN", "volt": "V", "volts": "V", "mv": "mV", "amp": "A", "amps": "A", "ma": "mA", "ms": "ms",
-    "msec": "ms", "millis": "ms", "us": "us", "usec": "us", "micros": "us", "ns": "ns", "nsec": "ns", "nanos": "ns",
-    "sec": "s", "secs": "s", "seconds": "s", "pct": "%", "percent": "%", "m": "m", "n": "N", "v": "V", "a": "A",
-    "s": "s",
-}  # fmt: skip
-_RATES = {"rad": "rad/s", "deg": "deg/s", "m": "m/s", "mm": "mm/s", "cm": "cm/s", "rev": "rev/s"}
 _PIECE = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 _BRACKETED = re.compile(r"[\[(]\s*([^\])\d]*?[/^]?[^\])]*?)\s*[\])]")
 
 
 def read_name(column: str, own: Collection[str] = ()) -> Label:
     """What a name says; own: words that name something of the model, whatever quantity they are elsewhere."""
-    plain = column.translate(_GREEK)
+    plain = column.translate(GREEK)
     unit = ""
     for match in _BRACKETED.finditer(plain):  # "angle [deg]", "speed (rad/s)"
         if word := _unit_of([piece.lower() for piece in re.findall(r"[A-Za-z%]+", match[1])]):
             unit, plain = word, plain.replace(match[0], " ")
+    unit = unit or ("%" if plain.rstrip().endswith("%") else "")  # valve_%
     pieces = pieces_of(plain)
     numbers = [int(piece) for piece in pieces if piece.isdigit()]
     words = [piece for piece in pieces if not piece.isdigit()]
     last = re.split(r"[^A-Za-z]+", plain.rstrip("0123456789_ "))[-1]
     parts = len(_PIECE.findall(last))
-    if not unit and 1 < parts < len(words) and last.lower() in _UNITS:  # mA, mNm, kN
-        unit, words = _UNITS[last.lower()], words[:-parts]
+    if not unit and 1 < parts < len(words) and last.lower() in UNITS:  # mA, mNm, kN
+        unit, words = UNITS[last.lower()], words[:-parts]
     if not unit and len(words) > 1:
         for length in (3, 2, 1):  # rad_per_s, rad_s, rad
             if len(words) > length and not _called(words, length, own) and (word := _unit_of(words[-length:])):
@@ -162,8 +120,8 @@ def read_name(column: str, own: Collection[str] = ()) -> Label:
     named, words = [word for word in words if word in own], [word for word in words if word not in own]
     flags, rest = _flags(words)
     rest += named
-    flags |= {"length"} if words and words[-1] in _ALONG | {"px", "py", "pz"} else set()
-    flags |= {"angle"} if words and words[-1] in _ABOUT else set()
+    flags |= {"length"} if words and words[-1] in ALONG | {"px", "py", "pz"} else set()
+    flags |= {"angle"} if words and words[-1] in ABOUT else set()
     kind = _kind(flags, unit, words)
     axis = _axis(words)
     if axis and kind in (Kind.POSITION, Kind.UNKNOWN) and _is_quaternion(words):
@@ -191,21 +149,21 @@ def _unit_of(pieces: list[str]) -> str:
     """The unit of the last words of a name."""
     pieces = [piece for piece in pieces if piece != "per"]
     if len(pieces) == 2 and pieces[1] in ("s", "sec", "second"):
-        return _RATES.get(_UNITS.get(pieces[0], ""), "")
+        return RATES.get(UNITS.get(pieces[0], ""), "")
     if pieces in (["n", "m"], ["newton", "meters"]):
         return "N m"
     if pieces == ["%"]:
         return "%"
-    return _UNITS.get(pieces[0], "") if len(pieces) == 1 else ""
+    return UNITS.get(pieces[0], "") if len(pieces) == 1 else ""
 
 
 def _flags(words: list[str]) -> tuple[set[str], list[str]]:
     """Which kinds of words a name has, and the words that are none of these."""
     table = {
-        "angle": _ANGLES, "length": _LENGTHS, "place": _PLACES, "speed": _SPEEDS, "acceleration": _ACCELERATIONS,
-        "torque": _TORQUES, "command": _COMMANDS, "desired": _DESIRED, "measured": _MEASURED, "current": _CURRENTS,
-        "voltage": _VOLTAGES, "duty": _DUTIES, "supply": _SUPPLIES, "time": _TIMES, "episode": _EPISODES,
-        "other": _OTHERS | TURNS,
+        "angle": ANGLES, "length": LENGTHS, "place": PLACES, "speed": SPEEDS, "acceleration": ACCELERATIONS,
+        "torque": TORQUES, "command": COMMANDS, "desired": DESIRED, "measured": MEASURED, "current": CURRENTS,
+        "voltage": VOLTAGES, "duty": DUTIES, "supply": SUPPLIES, "time": TIMES, "episode": EPISODES,
+        "other": OTHERS | TURNS,
     }  # fmt: skip
     flags: set[str] = set()
     rest = []
@@ -228,22 +186,25 @@ def _derivative_of(word: str) -> tuple[bool, str]:
     """Whether a word is a position's with a mark of a derivative, and that position's: dq, qd, thetadot."""
     for before, after in (("d", ""), ("", "dot"), ("", "d"), ("", "p")):
         inner = word[len(before) : len(word) - len(after)]
-        if word.startswith(before) and word.endswith(after) and inner in _POSITIONS and inner != word:
+        if word.startswith(before) and word.endswith(after) and inner in POSITIONS and inner != word:
             return True, inner
     return False, word
 
 
 def _kind(flags: set[str], unit: str, words: list[str]) -> Kind:
-    place = bool(flags & {"angle", "length", "place"})
+    wanted = "desired" in flags or any(word in COMMANDS - LETTERS for word in words)
+    if unit in OF_NO_JOINT.values() and not wanted:
+        return Kind.OTHER
+    place = bool(flags & {"angle", "length", "place"}) and not ("current" in flags and unit in ("A", "mA"))
     drive = _driven(flags, place)
     if words and words[-1] in ("time", "stamp", "timestamp"):
         return Kind.TIME
-    if _CELLS & {*words} and "load" not in words:
+    if CELLS & {*words} and "load" not in words:
         return Kind.OTHER
     if "supply" in flags and not place and not flags & {"current", "torque", "other"} and unit not in ("A", "mA", "%"):
         return Kind.SUPPLY
     of_another = place or flags & {"speed", "current", "voltage", "other"} or unit not in ("", "us", "%")
-    if ("duty" in flags and not of_another) or (unit == "us" and words and {*words} <= _PULSED):
+    if ("duty" in flags and not of_another) or (unit == "us" and words and {*words} <= PULSED):
         return Kind.DUTY
     if drive is not None:
         return drive
@@ -268,6 +229,7 @@ def _kind(flags: set[str], unit: str, words: list[str]) -> Kind:
     by_unit |= {"rad": Kind.POSITION, "deg": Kind.POSITION, "mm": Kind.POSITION, "rpm": Kind.VELOCITY}
     by_unit |= {"rad/s": Kind.VELOCITY, "deg/s": Kind.VELOCITY, "V": Kind.VOLTAGE, "A": Kind.CURRENT, "N": Kind.TORQUE}
     by_unit |= {"m/s": Kind.VELOCITY, "mm/s": Kind.VELOCITY, "m": Kind.POSITION, "cm": Kind.POSITION}
+    by_unit |= {"kN": Kind.TORQUE, "mN": Kind.TORQUE, "mA": Kind.CURRENT, "%": Kind.COMMAND}
     return by_unit.get(unit, Kind.OTHER if "measured" in flags and not words else Kind.UNKNOWN)
 
 
@@ -353,14 +315,22 @@ def _speaks(stem: str, *words: str) -> bool:
     return any(word in stem.lower() for word in words)
 
 
+def _ends(stem: str, letter: str) -> bool:
+    """Whether a component's name, without its axis and unit, ends with a letter."""
+    pieces = pieces_of(stem)
+    while len(pieces) > 1 and (pieces[-1] == "per" or _unit_of(pieces[-1:])):
+        pieces.pop()
+    return pieces[-1:] == [letter]
+
+
 def is_gyro(label: Label, stem: str) -> bool:
     """Whether a component of a vector with this name is a gyro's."""
-    return label.kind == Kind.VELOCITY and (_speaks(stem, "gyro", "omega", "ang") or pieces_of(stem)[-1:] == ["g"])
+    return label.kind == Kind.VELOCITY and (_speaks(stem, "gyro", "omega", "ang") or _ends(stem, "g"))
 
 
 def is_accelerometer(label: Label, stem: str) -> bool:
     """Whether it is an accelerometer's."""
-    return label.kind == Kind.ACCELERATION and (_speaks(stem, "acc", "linear") or pieces_of(stem)[-1:] == ["a"])
+    return label.kind == Kind.ACCELERATION and (_speaks(stem, "acc", "linear") or _ends(stem, "a"))
 
 
 def is_turn(label: Label, stem: str) -> bool:
@@ -376,7 +346,7 @@ def is_spin(label: Label, stem: str) -> bool:
         return not label.unit.startswith(("m", "cm"))
     if _speaks(stem, "ang", "omega", "gyro"):
         return True
-    if _ABOUT & {*pieces_of(label.column)}:
+    if ABOUT & {*pieces_of(label.column)}:
         return not _speaks(stem, "lin")
     return bool({"w", "g"} & {*pieces_of(stem)}) and not _speaks(stem, "vel", "lin")  # beside these `w` is the frame
 
@@ -388,7 +358,7 @@ def two_ways(label: Label, target: str) -> str:
         return ""
     if {"gx", "gy", "gz"} & pieces:
         return "a gyro tells it in the body's own axes: if it is one, give the model a <gyro>"
-    glued, linear = bool(_ABOUT & pieces), _speaks(label.vector, "lin")
+    glued, linear = bool(ABOUT & pieces), _speaks(label.vector, "lin")
     if label.unit or not (linear or _speaks(label.vector, "vel")) or not (glued or ("w" in pieces and not linear)):
         return ""
     other = "linear" if target.endswith("angular_velocity") else "angular"

@@ -8,7 +8,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from sipe_bayes.calibration.init.columns.names import SIDES, pieces_of
+from sipe_bayes.calibration.init.columns.names import pieces_of
+from sipe_bayes.calibration.init.columns.vocabulary import SIDES
 from sipe_bayes.calibration.init.draft import Unknown
 from sipe_bayes.calibration.init.fits import Fit
 from sipe_bayes.core.arrays import FloatArray

@@ -244,6 +244,7 @@ def as_parameters(model: mujoco.MjModel, unknowns: Sequence[Unknown]) -> list[Pa
 
 
 def least_of(model: mujoco.MjModel, unknown: Unknown) -> float:
-    """The least that its targets may be, in terms of what they are where bounds are."""
+    """The least that its targets may be, in terms of what bounds are of; factors of negative ones have none."""
     bound = [bind(model, target) for target in unknown.targets if not of_sensor(target)]
-    return max((1.01 * t.minimum / (t.value if unknown.relative else 1.0) for t in bound), default=-np.inf)
+    scales = [(t.minimum, t.value if unknown.relative else 1.0) for t in bound]
+    return max((1.01 * minimum / scale for minimum, scale in scales if scale > 0), default=-np.inf)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sipe_bayes.calibration.init.columns.names import Kind, alike, read_name
+from sipe_bayes.calibration.init.columns.names import Kind, alike, is_gyro, read_name
 
 
 @pytest.mark.parametrize(
@@ -45,6 +45,14 @@ from sipe_bayes.calibration.init.columns.names import Kind, alike, read_name
         ("battery_current", Kind.CURRENT, "", None),
         ("states[3]", Kind.UNKNOWN, "", 3),
         ("q_d", Kind.UNKNOWN, "", None),
+        ("Fcyl_kN", Kind.TORQUE, "kN", None),
+        ("valve_%", Kind.COMMAND, "%", None),
+        ("pA_bar", Kind.OTHER, "bar", None),
+        ("pressure_B_psi", Kind.OTHER, "psi", None),
+        ("payload_kg", Kind.OTHER, "kg", None),
+        ("Ausleger_Grad", Kind.POSITION, "deg", None),
+        ("IqY_mA", Kind.CURRENT, "mA", None),
+        ("iq_x", Kind.POSITION, "", None),
     ],
 )
 def test_what_a_name_says(column: str, kind: Kind, unit: str, number: int | None) -> None:
@@ -62,3 +70,11 @@ def test_names_that_are_spelt_shorter_are_alike() -> None:
 def test_a_unit_behind_what_a_joint_is_called() -> None:
     assert read_name("A1_current_A", {"a"}).unit == "A"
     assert read_name("position_A1", {"a"}).unit == ""
+
+
+@pytest.mark.parametrize("column", ["gx", "gx_dps", "imu_gx_dps", "gx [deg/s]", "gyro_x_rad_s", "imu.gx_deg_per_s"])
+def test_a_gyro_is_known_with_its_unit(column: str) -> None:
+    label = read_name(column)
+    assert is_gyro(label, label.vector)
+    other = read_name(column.replace("gyro_x", "vx").replace("gx", "vx"))
+    assert not is_gyro(other, other.vector)
