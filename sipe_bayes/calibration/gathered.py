@@ -36,6 +36,7 @@ _CUT = 2e-3  # of the range, within which an interval ends at a bound
 _MOVED = 2.0  # prior sds, by which logs that move a value say something else than its prior
 _DIFFERENT, _APART = 0.1, 3.0  # of the mean of the logs, and sds of a difference
 _NO_BODY = 0.01  # of the posterior, from which it is told
+_HARDLY_A_BODY = 0.5  # of the prior, likewise
 _NAMED = 3  # logs of what is summed up
 
 
@@ -244,16 +245,19 @@ def uneven_targets(environment: MjcfEnvironment) -> list[Finding]:
     ]
 
 
-def no_rigid_bodies(simulator: Simulator, posterior: Posterior, seed: int) -> list[Finding]:
-    """Where moments of inertia are unknown: a posterior of which a part is no body's, and is never simulated."""
-    environment = simulator.environment
+def no_rigid_bodies(environment: MjcfEnvironment, density: Posterior, seed: int, prior: bool = False) -> list[Finding]:
+    """Where moments of inertia are unknown: a density of which a part is no body's, and is never simulated.
+
+    prior: whether it is the prior, of which a part may be, but hardly all.
+    """
     own = [p.name for p in environment.space if any(".inertia_" in target for target in p.targets)]
     if not own:
         return []
-    drawn = posterior.sample((_DRAWS,), generator=torch.Generator().manual_seed(seed)).numpy()
+    drawn = density.sample((_DRAWS,), generator=torch.Generator().manual_seed(seed)).numpy()
     model = environment.compile()
     share = float(np.mean([not environment.write(model, values) for values in environment.space.values(drawn)]))
-    return [finding(Code.NO_RIGID_BODY, parameters=own, share=100 * share)] if share > _NO_BODY else []
+    name, least = ("prior", _HARDLY_A_BODY) if prior else ("posterior", _NO_BODY)
+    return [finding(Code.NO_RIGID_BODY, parameters=own, share=100 * share, density=name)] if share > least else []
 
 
 def not_better(scores: Sequence[ChannelScore]) -> list[Finding]:

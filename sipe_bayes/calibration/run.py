@@ -161,7 +161,7 @@ def _own(problem: Problem, method: Estimator, posterior: Posterior, asked: bool)
     elsewhere = {Code.AT_BOUND, Code.NOISE_EXCEEDS_SCATTER} if asked else {Code.AT_BOUND}
     spread = [] if method.uncertain else [finding(Code.SEARCH_SPREAD, method=method.name)]
     noticed = [item for item in method.findings if item.code not in elsewhere]
-    return noticed + spread + no_rigid_bodies(problem.simulator, posterior, method.seed)
+    return noticed + spread + no_rigid_bodies(problem.environment, posterior, method.seed)
 
 
 def _left_out(problem: Problem, method: Estimator) -> list[Finding]:
@@ -206,7 +206,7 @@ def run(
         num_threads: native ones; default all cores.
         progress: called along the way.
         device: that it simulates on, as ``Simulator`` has them.
-        tell: called with a line for each column that no simulation follows, before the fit takes its time.
+        tell: called with a line for what no simulation follows and what no body has, before the fit takes its time.
 
     Raises:
         ValueError: for input that cannot be used; the message is one line with the remedy.
@@ -217,7 +217,7 @@ def run(
     bind(problem.likelihood, problem.simulator, problem.train)
     if problem.holdout is not None:
         every_channel(problem, problem.holdout)
-    lost = not_followed(problem)
+    lost = (*no_rigid_bodies(problem.environment, problem.prior, 0, prior=True), *not_followed(problem))
     problem = replace(problem, findings=(*problem.findings, *lost))
     if tell is not None:
         for item in lost:

@@ -238,7 +238,7 @@ class Code(Enum):
     MEAN_OF_LOGS = caution(
         "{parameters} differs between the logs; held-out ones and identified.xml have the mean, {value:.4g}{unit}"
     )
-    NO_RIGID_BODY = caution("{parameters}: in {share:.0f} % of the posterior no rigid body has it (A + B < C)")
+    NO_RIGID_BODY = caution("{parameters}: in {share:.0f} % of the {density} no rigid body has it (A + B < C)")
     AT_PHYSICAL_BOUND = Text(
         Severity.NOTE,
         "{parameters} is at {bound:.4g}{unit}, and can not be smaller: in this model the logs show none of it up to "

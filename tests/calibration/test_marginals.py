@@ -12,7 +12,6 @@ from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.posterior import GaussianMixture, Particles, prior
-from sipe_bayes.simulation.simulator import Simulator
 
 
 def marginals(space: ParameterSpace, mean: list[float], natural: frozenset[str] = frozenset()) -> Marginals:
@@ -62,9 +61,11 @@ def test_a_posterior_that_no_rigid_body_can_have_is_told(across: float, middle: 
     moment = Parameter("moment", 0.0, 1.0, targets=("body:hull.inertia_zz",))
     environment = MjcfEnvironment.build(RAFT.format(across=across), [moment], [], ["joint:yaw.position"])
     normal = GaussianMixture([0.0], np.array([[middle]]), np.array([[[0.02**2]]]), environment.space)
-    noticed = no_rigid_bodies(Simulator(environment, 1), normal, 0)
+    noticed = no_rigid_bodies(environment, normal, 0)
     assert [one.code for one in noticed] == [Code.NO_RIGID_BODY] * (share > 0)
     assert all(abs(float(one.text.split("in ")[1].split(" %")[0]) - share) <= 3 for one in noticed)
+    before = no_rigid_bodies(environment, normal, 0, prior=True)  # of which half and less is as usual
+    assert [one.text.split(" no ")[0][-5:] for one in before] == ["prior"] * (share > 60)
 
 
 @pytest.mark.parametrize(("moved", "sd", "known"), [(0.0, 0.01, True), (0.015, 0.01, True), (0.03, 0.008, False)])

@@ -12,6 +12,7 @@ import numpy as np
 
 from sipe_bayes.calibration.config import Config, load_config
 from sipe_bayes.calibration.config_tables import Command, Measurement
+from sipe_bayes.calibration.gathered import no_rigid_bodies
 from sipe_bayes.calibration.init.columns.match import Match
 from sipe_bayes.calibration.init.columns.names import read_name
 from sipe_bayes.calibration.init.columns.signals import turn_of
@@ -36,8 +37,10 @@ from sipe_bayes.calibration.init.windows import (
 )
 from sipe_bayes.calibration.problem import environment_of
 from sipe_bayes.calibration.readers.tables import read_table
+from sipe_bayes.core.finding_advice import ADVICE
 from sipe_bayes.core.units import find_unit
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
+from sipe_bayes.posterior import prior
 
 _LOGS = 3  # that are simulated
 _BETTER = np.log(1.5)  # of the logarithm of misses together, from which another reading is named
@@ -67,7 +70,8 @@ def checked(path: Path) -> Checked:
         ModelError: for a model that does not compile.
     """
     config = load_config(path)
-    environment_of(config, config.logs_for("train"), config.logs_for("holdout"))  # raises what a calibration would
+    environment = environment_of(config, config.logs_for("train"), config.logs_for("holdout"))  # raises as a run
+    bodies = no_rigid_bodies(environment, prior(environment.space), 0, prior=True)
     folder = path.parent
     model = compile_spec(load_spec(str(config.model)), str(config.model))
     machine = Machine.of(model)
@@ -103,6 +107,7 @@ def checked(path: Path) -> Checked:
         if late and delays and left.best * logs[0].dt > max(p.range[1] for p in delays):
             out.append(f"parameters: {note}, beyond the bounds of {delays[0].name!r}; widen them")
     doubts = [doubt for doubt in better.open_doubts if doubt != draft.clock.doubt]
+    out = [f"parameters: {one.text}. {ADVICE[one.code]}" for one in bodies] + out
     return Checked(
         out + _clipped(config, draft, machine, opened) + _slopes(draft, opened) + _turns(draft, opened), doubts
     )
