@@ -270,7 +270,7 @@ def _would_be(calibration: Calibration, name: str, sds: float) -> str:
     j = posterior.space.names.index(name)
     theta, sd, parameter = float(posterior.mode[j]), float(posterior.stddev[j]), posterior.space[j]
     here, there = (float(parameter.value(x)) for x in (theta, min(max(theta + sds * sd, 0.0), 1.0)))
-    new, old = (significant(x, 10 * abs(there - here), here) for x in (there, here))
+    new, old = (significant(x, 3 * abs(there - here), here) for x in (there, here))
     return f"{name} would be about {new}, not {old} {parameter.unit}".rstrip()
 
 
