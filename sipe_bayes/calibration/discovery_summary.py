@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sipe_bayes.calibration.gathered import Marginals
+from sipe_bayes.calibration.gathered import Marginals, no_rigid_bodies
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
@@ -104,7 +104,11 @@ def summarise(
         rollouts=structures.rollouts,
         column_rollouts=structures.state.column_rollouts,
         seconds=time.monotonic() - began,
-        findings=(*_budget_spent(structures), *_thinned(problem, structures)),
+        findings=(
+            *_budget_spent(structures),
+            *no_rigid_bodies(problem.environment, problem.prior, 0, prior=True),
+            *_thinned(problem, structures),
+        ),
     )
 
 

@@ -90,6 +90,11 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
     "not trusted": (changed(FRICTION, **left(LARGE)), "bad", "No value may be trusted within its interval yet"),
     "unknown, not trusted": (changed(FRICTION, **left(None)), "bad", "No value may be trusted within its interval yet"),
     "not settled": (changed(FRICTION, settled=False), "bad", "raise its budget"),
+    "not settled, no fact": (
+        changed(FRICTION, settled=False),
+        "bad",
+        "that were fitted not all to their end, the best has",
+    ),
     "cut short": (changed(FRICTION, settled=False, findings=(CUT,)), "bad", "--budget 60000, and the same folder"),
     "cut short, wider": (
         changed(FRICTION, settled=False, findings=(CUT,), **widened(make_discovery())),
