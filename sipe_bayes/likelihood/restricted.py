@@ -31,8 +31,8 @@ class Pulls:
         start_pull: (W, D), its negative gradient.
         free: (N,), parameters that may move. One held at a bound against its pull is no unknown of the linear model:
             with it the residuals would be credited with an optimum that is not allowed.
-        held: whether the residuals are credited with no optimum at all but taken as they are, since no simulation
-            follows the linear model to it.
+        held: whether the residuals are credited with no optimum at all, since no simulation follows the linear model to
+            it; what is unknown takes its degrees of freedom all the same.
     """
 
     prior: FloatArray

@@ -2,8 +2,8 @@
 
 Where the plain model leaves much of a channel unexplained, each channel that moves and each command is multiplied by
 -1, 180 / pi, 1000 and their inverses, and the model fitted again, the least explained columns first and signs before
-units, as far as a share of the budget goes. A factor is only right where with it the channel is explained. For a
-channel y, p(y) = |f|^n p(f y), n its samples that are fitted.
+units, as far as a share of the budget goes. A factor is only right where it explains the channel: where the model lacks
+much, a wrong one fits better than none. For a channel y, p(y) = |f|^n p(f y), n its samples that are fitted.
 """
 
 from __future__ import annotations
@@ -63,45 +63,53 @@ def moving(windows: Windows) -> BoolArray:
     return np.asarray(windows.spread**2 > noise**2 * (1 + np.maximum(chance, 0.2)))
 
 
-def unexplained(windows: Windows, sd: FloatArray, shown: BoolArray, column: Column | None = None) -> dict[str, float]:
-    """The share of a channel's spread that the residuals' sd (C,) is, by name of those that are ``shown`` to move.
-
-    column: that was corrected where the residuals are of logs that ``windows`` have as they were.
-    """
-    own = [column is not None and not column.command and column.name == name for name in windows.fitted]
-    spread = windows.spread * np.where(own, 1.0 if column is None else abs(column.factor), 1.0)
+def unexplained(windows: Windows, sd: FloatArray, shown: BoolArray) -> dict[str, float]:
+    """The share of a channel's spread that the residuals' sd (C,) is, by name of those that are ``shown`` to move."""
     names = np.array(windows.fitted)[shown].tolist()
-    return dict(zip(names, (sd[shown] / spread[shown]).tolist(), strict=True))
+    return dict(zip(names, (sd[shown] / windows.spread[shown]).tolist(), strict=True))
 
 
-def told_by(environment: MjcfEnvironment, name: str, command: bool, share: Mapping[str, float]) -> float:
-    """The largest share among the channels that tell a column, of a command those of the joint that it drives."""
-    if not command:
-        return share.get(name, 0.0)
+def channels_of(environment: MjcfEnvironment) -> dict[tuple[str, bool], tuple[str, ...]]:
+    """The channels that tell a column, by its name and whether it is a command: of that its joint's, else all."""
     model, targets = environment.compile(), {c.label: c.target for c in environment.measurements}
-    joint = driven_joint(model, model.actuator(name).id)
-    site = f"joint:{model.joint(joint).name}." if joint >= 0 else None
-    own = [left for channel, left in share.items() if site is not None and targets[channel].startswith(site)]
-    return max(own or share.values(), default=0.0)
+    out: dict[tuple[str, bool], tuple[str, ...]] = {(name, False): (name,) for name in environment.channels}
+    for actuator in environment.actuators:
+        joint = driven_joint(model, model.actuator(actuator).id)
+        site = f"joint:{model.joint(joint).name}." if joint >= 0 else None
+        own = tuple(name for name, target in targets.items() if site is not None and target.startswith(site))
+        out[actuator, True] = own or tuple(environment.channels)
+    return out
 
 
-def is_explained(environment: MjcfEnvironment, share: Mapping[str, float], column: Column, most: float) -> bool:
-    """Whether with a column corrected no more than ``most`` is left of the channels that tell it."""
-    return told_by(environment, column.name, column.command, share) < most
+def is_explained(
+    windows: Windows, sd: FloatArray, shown: BoolArray, column: Column, own: Sequence[str], most: float
+) -> bool:
+    """Whether beyond noise no more than a share of a column's ``own`` channels is left, of those that move.
+
+    The residuals' sd (C,) is that with the column corrected, ``windows`` have the logs as they were.
+    """
+    noise = noise_level(windows.trajectories, windows.settings, windows.simulator)[windows.channels]
+    corrected = np.array([name == column.name and not column.command for name in windows.fitted])
+    beyond = np.maximum((sd / np.where(corrected, abs(column.factor), 1.0)) ** 2 - noise**2, 0.0)
+    share = unexplained(windows, np.sqrt(beyond), shown)
+    return max((share[name] for name in own if name in share), default=0.0) < most
 
 
-def choices(environment: MjcfEnvironment, share: Mapping[str, float]) -> list[Column]:
+def choices(channels: Mapping[tuple[str, bool], Sequence[str]], share: Mapping[str, float]) -> list[Column]:
     """Every channel given and every command with every factor, what promises most first.
 
     A column promises more the less is explained of it, of a command of the channels of the joint that it drives; and a
     factor the earlier it stands in ``FACTORS``: from one column to the next as much as from one factor to the next.
 
     Args:
-        environment: whose columns.
+        channels: ``channels_of``.
         share: of each channel that may be wrong, how much of its spread is unexplained.
     """
-    columns = [*((name, False) for name in share), *((name, True) for name in environment.actuators)]
-    promise = {column: told_by(environment, *column, share) for column in columns}
+    promise = {
+        (name, command): max((share[c] for c in own if c in share), default=0.0)
+        for (name, command), own in channels.items()
+        if command or name in share
+    }
     ranked = enumerate(sorted(promise, key=lambda column: -promise[column]))
     every = [(rank + k, Column(*column, factor)) for rank, column in ranked for k, factor in enumerate(FACTORS)]
     return [column for _, column in sorted(every, key=lambda item: item[0])]

@@ -42,7 +42,7 @@ from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.structure.candidates import Candidate, candidates, first
-from sipe_bayes.structure.columns import Column, choices, is_explained, log_jacobian, moving, unexplained
+from sipe_bayes.structure.columns import Column, channels_of, choices, is_explained, log_jacobian, moving, unexplained
 from sipe_bayes.structure.extension import Extension, Placed, members, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
 from sipe_bayes.structure.machine import Machine, machine_of
@@ -193,14 +193,15 @@ class StructureSearch:
         """The column whose factor makes the plain model fit far better, if any does."""
         given, plain, options = self.given, state.fitted[0] if state.fitted else None, self.options
         state, share = replace(state, phase=Phase.RANK), dict.fromkeys(given.environment.channels, 0.0)
-        shown = moving(windows := given.windows(given.simulator([])))
+        windows, channels = given.windows(given.simulator([])), channels_of(given.environment)
+        shown = moving(windows)
         if plain is not None:
             left = unexplained(windows, plain.sd, shown)
             if max(left.values(), default=0.0) < options.gross:
                 return state
             rests = set(np.array(windows.fitted)[~shown].tolist())
             share = {name: left.get(name, 0.0) for name in share if name not in rests}
-        columns, tried, spent, number = choices(given.environment, share), [], 0, 0
+        columns, tried, spent, number = choices(channels, share), [], 0, 0
         # without a plain model there is nothing else to spend the budget on
         most = self.budget if plain is None else options.column_share * (self.budget - plain.rollouts)
         while number < len(columns) and spent + options.column_budget <= most:
@@ -208,8 +209,8 @@ class StructureSearch:
             self._doing = f"{self.describe(replace(state, phase=Phase.COLUMNS))}, {number} of {len(columns)}"
             one, rollouts = self._try([column], options.column_budget)
             spent += rollouts
-            after = {} if one is None else unexplained(windows, one.sd, shown, column)
-            if one is not None and (plain is None or is_explained(given.environment, after, column, options.gross)):
+            own = channels[column.name, column.command]
+            if one is not None and (not plain or is_explained(windows, one.sd, shown, column, own, options.gross)):
                 tried.append((one.evidence + log_jacobian(windows, column), column, one))
         if plain is None and not tried:
             given.fit([], None, self.enough([]))  # raises what keeps the plain model from being fitted

@@ -265,6 +265,24 @@ def test_without_starts_the_windows_are_summed(name: str, noise: Noise, free: tu
 
 @ALL
 @EVERY_NOISE
+@pytest.mark.parametrize("held", [False, True])
+def test_the_slopes_are_those_of_the_restricted_likelihood(name: str, noise: Noise, held: bool) -> None:
+    """With starts, and whether or not the linear model's gain counts."""
+    case, rng = PROBLEMS[name], np.random.default_rng(4)
+    channels, h = case.observed.shape[2], 1e-6
+    noise = Noise(noise.sd[:channels], noise.tau[:channels])
+    pulls = Pulls(np.eye(N), rng.normal(size=N), PRECISION, rng.normal(size=(len(case.log), D)), np.ones(N, bool), held)
+    moments = case.moments()
+    value, by_sd, _ = restricted_slopes(moments, noise, pulls)
+    assert value == restricted(moments, noise, pulls)[0]
+    for c in range(channels):
+        up = np.exp(h * np.eye(channels)[c])
+        more, less = (restricted(moments, Noise(sd, noise.tau), pulls)[0] for sd in (noise.sd * up, noise.sd / up))
+        np.testing.assert_allclose(by_sd[c], (more - less) / (2 * h), rtol=1e-5, atol=1e-5)
+
+
+@ALL
+@EVERY_NOISE
 def test_marginal_likelihood_integrates_the_starts_out(name: str, noise: Noise) -> None:
     """At its reference the residual is normal with covariance V + J P^-1 J', whatever the starts."""
     case, rng = PROBLEMS[name], np.random.default_rng(3)

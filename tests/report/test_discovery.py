@@ -93,7 +93,7 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
     "not settled, no fact": (
         changed(FRICTION, settled=False),
         "bad",
-        "that were fitted not all to their end, the best has",
+        "were fitted to their end; of these, the best has",
     ),
     "cut short": (changed(FRICTION, settled=False, findings=(CUT,)), "bad", "--budget 60000, and the same folder"),
     "cut short, wider": (

@@ -81,8 +81,9 @@ def headline(discovery: Discovery) -> Verdict:
         for p in discovery.kept
     ]
     if kept and (cut_short(discovery) or not discovery.settled):
-        when = "before the budget was spent" if cut_short(discovery) else "not all to their end"
-        among = f"Of the {len(discovery.rows)} structures that were fitted {when}"
+        among = f"Not all of the {len(discovery.rows)} structures were fitted to their end; of these"
+        if cut_short(discovery):
+            among = f"Of the {len(discovery.rows)} structures that were fitted before the budget was spent"
         return Verdict("bad", f"{among}, the best has {'; and '.join(kept)} among these.")
     if kept:
         return Verdict("good" if discovery.passes else "fair", f"The model lacks {'; and '.join(kept)}.")

@@ -13,7 +13,7 @@ from sipe_bayes.calibration.init.columns.match import SURE, Match, Matches
 from sipe_bayes.calibration.init.columns.names import Kind, Label, alike, is_exactly, number_of, pieces_of, read_name
 from sipe_bayes.calibration.init.columns.signals import slope_of
 from sipe_bayes.calibration.init.columns.vectors import held_open, match_vectors
-from sipe_bayes.calibration.init.columns.vocabulary import LETTERS, OF_BODIES
+from sipe_bayes.calibration.init.columns.vocabulary import LETTERS, OF_BODIES, OF_NO_JOINT
 from sipe_bayes.calibration.init.machine import Actuator, Drive, Joint, Machine
 from sipe_bayes.core.arrays import FloatArray
 
@@ -37,6 +37,7 @@ def match_columns(machine: Machine, table: Table) -> Matches:
     vectors, labels = match_vectors(machine, labels)
     vectors, open_vectors = held_open(vectors)
     labels = _called_as_actuators(machine, _called_as_joints(machine, labels), _SAYS_NOTHING)
+    labels = [replace(x, kind=Kind.OTHER) if x.kind == Kind.UNKNOWN and x.unit == "%" else x for x in labels]
     unnamed = {label.column for label in labels if label.kind == Kind.UNKNOWN}
     labels, open_commands = _unravelled(machine, labels, table)
     labels, of_tendons = _of_tendons(machine, labels)
@@ -99,7 +100,7 @@ def _own_words(machine: Machine) -> set[str]:
 
     Of these ``gx`` and ``ax`` are short enough to be anything.
     """
-    own = {piece for joint in machine.joints for piece in pieces_of(joint.name)} & (OF_BODIES | LETTERS)
+    own = {piece for joint in machine.joints for piece in pieces_of(joint.name)} & {*OF_BODIES, *LETTERS, *OF_NO_JOINT}
     sensors = {kind for _, kind in machine.sensors}
     for kind, letter in (("gyro", "g"), ("accelerometer", "a")):
         if not machine.bodies and kind not in sensors:

@@ -21,7 +21,6 @@ from sipe_bayes.calibration.init.columns.vocabulary import (
     EPISODES,
     GREEK,
     LENGTHS,
-    LETTERS,
     MEASURED,
     OF_NO_JOINT,
     OTHERS,
@@ -92,12 +91,13 @@ class Label:
 
 
 _PIECE = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_GERMAN_DEGREES = re.compile(r"Grad(?![a-z])")
 _BRACKETED = re.compile(r"[\[(]\s*([^\])\d]*?[/^]?[^\])]*?)\s*[\])]")
 
 
 def read_name(column: str, own: Collection[str] = ()) -> Label:
     """What a name says; own: words that name something of the model, whatever quantity they are elsewhere."""
-    plain = column.translate(GREEK)
+    plain = _GERMAN_DEGREES.sub("deg", column.translate(GREEK))
     unit = ""
     for match in _BRACKETED.finditer(plain):  # "angle [deg]", "speed (rad/s)"
         if word := _unit_of([piece.lower() for piece in re.findall(r"[A-Za-z%]+", match[1])]):
@@ -123,6 +123,7 @@ def read_name(column: str, own: Collection[str] = ()) -> Label:
     flags |= {"length"} if words and words[-1] in ALONG | {"px", "py", "pz"} else set()
     flags |= {"angle"} if words and words[-1] in ABOUT else set()
     kind = _kind(flags, unit, words)
+    unit = "" if unit in OF_NO_JOINT.values() and kind != Kind.OTHER else unit
     axis = _axis(words)
     if axis and kind in (Kind.POSITION, Kind.UNKNOWN) and _is_quaternion(words):
         kind = Kind.QUATERNION
@@ -192,8 +193,8 @@ def _derivative_of(word: str) -> tuple[bool, str]:
 
 
 def _kind(flags: set[str], unit: str, words: list[str]) -> Kind:
-    wanted = "desired" in flags or any(word in COMMANDS - LETTERS for word in words)
-    if unit in OF_NO_JOINT.values() and not wanted:
+    says = {*words} & (POSITIONS | COMMANDS)
+    if unit in OF_NO_JOINT.values() and says <= {"p", "a"} and not flags & {"torque", "desired"}:
         return Kind.OTHER
     place = bool(flags & {"angle", "length", "place"}) and not ("current" in flags and unit in ("A", "mA"))
     drive = _driven(flags, place)
@@ -229,7 +230,7 @@ def _kind(flags: set[str], unit: str, words: list[str]) -> Kind:
     by_unit |= {"rad": Kind.POSITION, "deg": Kind.POSITION, "mm": Kind.POSITION, "rpm": Kind.VELOCITY}
     by_unit |= {"rad/s": Kind.VELOCITY, "deg/s": Kind.VELOCITY, "V": Kind.VOLTAGE, "A": Kind.CURRENT, "N": Kind.TORQUE}
     by_unit |= {"m/s": Kind.VELOCITY, "mm/s": Kind.VELOCITY, "m": Kind.POSITION, "cm": Kind.POSITION}
-    by_unit |= {"kN": Kind.TORQUE, "mN": Kind.TORQUE, "mA": Kind.CURRENT, "%": Kind.COMMAND}
+    by_unit |= {"kN": Kind.TORQUE, "mN": Kind.TORQUE, "mA": Kind.CURRENT}
     return by_unit.get(unit, Kind.OTHER if "measured" in flags and not words else Kind.UNKNOWN)
 
 
@@ -318,7 +319,8 @@ def _speaks(stem: str, *words: str) -> bool:
 def _ends(stem: str, letter: str) -> bool:
     """Whether a component's name, without its axis and unit, ends with a letter."""
     pieces = pieces_of(stem)
-    while len(pieces) > 1 and (pieces[-1] == "per" or _unit_of(pieces[-1:])):
+    units = [piece == "per" or piece.isdigit() or bool(_unit_of([piece])) for piece in pieces]
+    while len(pieces) > 1 and pieces[-1] != letter and units[len(pieces) - 1]:
         pieces.pop()
     return pieces[-1:] == [letter]
 

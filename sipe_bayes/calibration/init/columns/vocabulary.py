@@ -72,8 +72,9 @@ UNITS = {
     "mn": "mN", "kn": "kN", "volt": "V", "volts": "V", "mv": "mV", "amp": "A", "amps": "A", "ma": "mA", "ms": "ms",
     "msec": "ms", "millis": "ms", "us": "us", "usec": "us", "micros": "us", "ns": "ns", "nsec": "ns", "nanos": "ns",
     "sec": "s", "secs": "s", "seconds": "s", "pct": "%", "percent": "%", "m": "m", "n": "N", "v": "V", "a": "A",
-    "s": "s", "grad": "deg",
+    "s": "s",
 }  # fmt: skip
-OF_NO_JOINT = {"bar": "bar", "mbar": "mbar", "psi": "psi", "pa": "Pa", "kpa": "kPa", "mpa": "MPa", "kg": "kg"}
+OF_NO_JOINT = {"bar": "bar", "mbar": "mbar", "pa": "Pa", "kpa": "kPa", "mpa": "MPa", "kg": "kg"}
+"""Units of pressures and of weights; psi is an angle as well."""
 UNITS |= OF_NO_JOINT
 RATES = {"rad": "rad/s", "deg": "deg/s", "m": "m/s", "mm": "mm/s", "cm": "cm/s", "rev": "rev/s"}

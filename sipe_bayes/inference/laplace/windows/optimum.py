@@ -52,7 +52,8 @@ class Ending:
         steps: from there.
         first_misfit: of the residuals at the starting point, in units of the channels' spread.
         refused: nats that the last steps were to gain, none of which gained anything.
-        tells: whether that is something to be said: not where differences are long, or the surroundings are looked at.
+        tells: whether that is a finding: not where differences are long, or the surroundings are looked at. The normal
+            stays where the search ended, and reaches as far as was promised, either way.
         settled: whether nothing moved any more.
         cut_short: whether the budget ends.
         bettered: the optimum before, from which a pattern search led here; this one is to be no narrower.
@@ -206,8 +207,8 @@ def judged(
     """
     most, covariance, reason = problem.options.tuning.windows.most_drift, optimum.covariance, optimum.finding
     unsmooth, gain, off = ending.tells and ending.refused > most, ending.refused, optimum.mean - ending.theta
-    if sandwiches(windows):  # in nats of its own width
-        gain = 0.5 * float(off @ np.linalg.pinv(covariance, hermitian=True) @ off)
+    if windows.num_start and sandwiches(windows):  # in nats of its own width
+        gain = 0.5 * float(off @ np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) @ off)
     if ending.cut_short and not ending.settled:
         reason = finding(Code.SEARCH_CUT_SHORT)
     elif not ending.settled:

@@ -192,10 +192,7 @@ class WindowSearch:
         return replace(here, group=number)
 
     def _subset(self, state: WindowState) -> WindowState:
-        """A step of theta alone, the starts as the log tells them, on every other window.
-
-        Near the optimum the search goes on with all.
-        """
+        """A step of theta alone on every other window, starts as the log tells them; near the optimum all follow."""
         windows, here, tuning = self.windows, state.here, self._tuning.windows
         view = windows.every_other()
         before, starts, kept = view.rollouts, view.no_starts(), here.kept.residual
@@ -259,11 +256,12 @@ class WindowSearch:
         windows, here = self.windows, state.here
         lin, stale, drift = self._linearise(here)
         moments, coloured = windows.moments(lin, white=self._white), windows.settings.noise == "ar1"
-        at, prior = (here.noise, here.theta, here.starts), self.problem.quadratic_prior
-        noise = updated_noise(windows, moments, *at, prior, coloured, is_broken(self.problem, windows, here.refused))
+        at, held = (here.noise, here.theta, here.starts), is_broken(self.problem, windows, here.refused)
+        noise = updated_noise(windows, moments, *at, self.problem.quadratic_prior, coloured, held)
         step, converged = self._stepped(state, lin, moments, noise, stale, drift)
-        # where theta does not move for the noise that is best there, both are
+        # where theta does not move for the noise that is best there, both are; not for one that a broken promise made
         settled = converged and (not step.fit.gained or same_noise(noise, here.noise))
+        settled &= held or not is_broken(self.problem, windows, step.fit.refused)
         return self._continued(state, step, Phase.NOISE if converged else Phase.DESCEND, settled)
 
     def _linearise(self, here: Position) -> tuple[Linearisation, bool, float]:

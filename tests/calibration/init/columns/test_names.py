@@ -2,7 +2,7 @@
 
 import pytest
 
-from sipe_bayes.calibration.init.columns.names import Kind, alike, is_gyro, read_name
+from sipe_bayes.calibration.init.columns.names import Kind, alike, is_accelerometer, is_gyro, read_name
 
 
 @pytest.mark.parametrize(
@@ -46,9 +46,17 @@ from sipe_bayes.calibration.init.columns.names import Kind, alike, is_gyro, read
         ("states[3]", Kind.UNKNOWN, "", 3),
         ("q_d", Kind.UNKNOWN, "", None),
         ("Fcyl_kN", Kind.TORQUE, "kN", None),
-        ("valve_%", Kind.COMMAND, "%", None),
+        ("valve_%", Kind.UNKNOWN, "%", None),
+        ("yaw_psi", Kind.POSITION, "", None),
+        ("eta_ψ", Kind.POSITION, "", None),
+        ("theta_bar", Kind.POSITION, "", None),
+        ("Pressure set (bar)", Kind.SETPOINT, "", None),
+        ("u_bar", Kind.COMMAND, "", None),
+        ("thrust_kg", Kind.TORQUE, "", None),
+        ("load_cell_kg", Kind.TORQUE, "", None),
+        ("cost_grad", Kind.UNKNOWN, "", None),
         ("pA_bar", Kind.OTHER, "bar", None),
-        ("pressure_B_psi", Kind.OTHER, "psi", None),
+        ("pressure_B_psi", Kind.OTHER, "", None),
         ("payload_kg", Kind.OTHER, "kg", None),
         ("Ausleger_Grad", Kind.POSITION, "deg", None),
         ("IqY_mA", Kind.CURRENT, "mA", None),
@@ -78,3 +86,10 @@ def test_a_gyro_is_known_with_its_unit(column: str) -> None:
     assert is_gyro(label, label.vector)
     other = read_name(column.replace("gyro_x", "vx").replace("gx", "vx"))
     assert not is_gyro(other, other.vector)
+
+
+@pytest.mark.parametrize("column", ["ax", "imu_ax", "imu.ax", "base_ax_m_s2", "acc_x"])
+def test_an_accelerometer_is_known_whatever_stands_before(column: str) -> None:
+    """Its letter is also ampere's."""
+    label = read_name(column)
+    assert is_accelerometer(label, label.vector)
