@@ -103,6 +103,7 @@ ADVICE: dict[Code, str] = {
         "its driver; else at what the model lacks."
     ),
     Code.NOT_SMOOTH: f"{_COMPARE} {_SMOOTHER}",
+    Code.KINK: "Nothing to do, unless intervals are too wide: other motions have their kinks elsewhere.",
     Code.STARTS_AT_REST: (
         "Without a pose a window of a free body starts anywhere but where the body was. Measure it, or take the "
         "likelihood that infers states."

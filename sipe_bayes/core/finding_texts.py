@@ -161,17 +161,17 @@ class Code(Enum):
         "the budget ended before the search had settled: the estimate is the best so far, and its intervals are "
         "guessed from the way it has come; give a larger budget, and the same folder goes on"
     )
-    SEARCH_UNSETTLED = blocking(
-        "the search had not settled after {steps} steps: look at the residuals before you trust the intervals"
-    )
+    SEARCH_UNSETTLED = blocking("the search had not settled after {steps} steps: look at the residuals first")
     WILD_SAMPLES = caution(
         "{count} samples of {channels} in {logs} logs were left out of the fit: no smooth motion explains them "
         "(glitches, or what the model lacks)"
     )
     NOT_SMOOTH = blocking(
         "at the optimum the simulation is not what its linearisation says, by {gain:.1f} nats of a step or of a "
-        "point nearby: it is not smooth there (friction, contact or delay); compare with mcmc before you trust the "
-        "intervals"
+        "point nearby: it is not smooth there (friction, contact or delay); compare with mcmc"
+    )
+    KINK = caution(
+        "at the optimum a step that promised {gain:.0f} nats gained none (a kink, of dry friction?): intervals hold it"
     )
     STARTS_AT_REST = blocking(
         "the measurements do not tell the whole pose of joint {joint}: every window starts the rest of it where the "

@@ -100,3 +100,7 @@ def test_what_no_simulation_keeps_counts_neither_for_the_noise_nor_for_the_optim
     judgement = judged(method.problem, windows, broken, None, replace(promising, refused=100.0))
     assert judgement.unsmooth
     assert (judgement.mean == ending.theta).all()
+    quiet = judged(method.problem, windows, broken, None, replace(promising, refused=100.0, tells=False))
+    assert quiet.finding is not None
+    assert quiet.finding.code is Code.KINK
+    assert (quiet.covariance == judgement.covariance).all()
