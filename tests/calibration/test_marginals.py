@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pytest
 
 from sipe_bayes.calibration.gathered import Marginals, no_rigid_bodies
+from sipe_bayes.calibration.init.check import checked
+from sipe_bayes.calibration.run import run
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -66,6 +69,24 @@ def test_a_posterior_that_no_rigid_body_can_have_is_told(across: float, middle: 
     assert all(abs(float(one.text.split("in ")[1].split(" %")[0]) - share) <= 3 for one in noticed)
     before = no_rigid_bodies(environment, normal, 0, prior=True)  # of which half and less is as usual
     assert [one.text.split(" no ")[0][-5:] for one in before] == ["prior"] * (share > 60)
+
+
+MOMENT = """
+[[parameters]]
+name = "moment"
+target = "body:cart.inertia_zz"
+bounds = [0.002, {high}]
+"""
+
+
+@pytest.mark.parametrize(("high", "odd"), [(0.1, True), (0.01, False)])
+def test_a_prior_that_hardly_any_body_has_is_told_before_the_fit(config: Path, high: float, odd: bool) -> None:
+    """A ball's moments are .004 each, of which the third is .008 at most; by the check and ahead of a calibration."""
+    config.write_text(config.read_text() + MOMENT.format(high=high))
+    assert any("of the prior no rigid body has it" in line for line in checked(config).odd) == odd
+    lines: list[str] = []
+    run(config, budget=40, out=config.parent / "out", tell=lines.append)
+    assert any("of the prior no rigid body has it" in line for line in lines) == odd
 
 
 @pytest.mark.parametrize(("moved", "sd", "known"), [(0.0, 0.01, True), (0.015, 0.01, True), (0.03, 0.008, False)])
