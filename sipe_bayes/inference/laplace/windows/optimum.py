@@ -75,9 +75,15 @@ class Ending:
     bettered: WindowOptimum | None
 
 
-def is_broken(problem: SearchProblem, windows: Windows, refused: float) -> bool:
-    """Whether nats that steps of theta and the starts were to gain, none of which did, are more than rounding."""
-    return windows.num_start > 0 and refused > problem.options.tuning.windows.most_drift
+def is_broken(problem: SearchProblem, windows: Windows, theta: FloatArray, refused: float) -> bool:
+    """Whether a linearisation at theta (N,) promises what no simulation keeps.
+
+    Steps of theta and the starts that were to gain more than rounding, ``refused`` nats, have gained nothing. Where a
+    delay is unknown they have to be many more: over less than a physics step none acts, but its secant may be right.
+    """
+    tuning = problem.options.tuning.windows
+    most = tuning.most_drift_of_delays if windows.least_steps(theta).any() else tuning.most_drift
+    return windows.num_start > 0 and refused > most
 
 
 def summarised(problem: SearchProblem, windows: Windows, ending: Ending) -> WindowOptimum:
@@ -85,7 +91,7 @@ def summarised(problem: SearchProblem, windows: Windows, ending: Ending) -> Wind
     theta, starts, noise, moments = ending.theta, ending.starts, ending.noise, ending.moments
     prior, start_pull, sandwiched = problem.quadratic_prior, -windows.start_precision * starts, sandwiches(windows)
     solved = eliminate_starts(moments.normal(noise), moments.num_theta, windows.start_precision, start_pull)
-    held = is_broken(problem, windows, ending.refused)
+    held = is_broken(problem, windows, theta, ending.refused)
     here = pulls(windows, prior, theta, starts, solved.gradient, held)
     prior_energy = prior.energy(theta) + 0.5 * float((starts**2 @ windows.start_precision).sum())
     evidence = restricted(moments, noise, replace(here, free=np.full(len(theta), True)))[0] - prior_energy
@@ -230,7 +236,7 @@ def judged(
         left = misfit(windows, ending.residual) / ending.first_misfit
         way = float(np.sqrt(((ending.theta - ending.begin) ** 2).mean()))
         covariance = covariance + (way * min(1.0, left)) ** 2 * np.eye(len(ending.theta))
-    if is_broken(problem, windows, ending.refused):
+    if is_broken(problem, windows, ending.theta, ending.refused):
         reason = reason or finding(Code.KINK, gain=ending.refused)
         # the normal's middle lies where a slope led that no simulation follows
         refused = np.clip(optimum.mean, 0.0, 1.0) - ending.theta

@@ -256,12 +256,13 @@ class WindowSearch:
         windows, here = self.windows, state.here
         lin, stale, drift = self._linearise(here)
         moments, coloured = windows.moments(lin, white=self._white), windows.settings.noise == "ar1"
-        at, held = (here.noise, here.theta, here.starts), is_broken(self.problem, windows, here.refused)
-        noise = updated_noise(windows, moments, *at, self.problem.quadratic_prior, coloured, held)
+        at, prior = (here.theta, here.starts), self.problem.quadratic_prior
+        held = is_broken(self.problem, windows, here.theta, here.refused)
+        noise = updated_noise(windows, moments, here.noise, *at, prior, coloured, held)
         step, converged = self._stepped(state, lin, moments, noise, stale, drift)
         # where theta does not move for the noise that is best there, both are; not for one that a broken promise made
         settled = converged and (not step.fit.gained or same_noise(noise, here.noise))
-        settled &= held or not is_broken(self.problem, windows, step.fit.refused)
+        settled &= held or not is_broken(self.problem, windows, here.theta, step.fit.refused)
         return self._continued(state, step, Phase.NOISE if converged else Phase.DESCEND, settled)
 
     def _linearise(self, here: Position) -> tuple[Linearisation, bool, float]:
