@@ -25,9 +25,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.stats import bartlett
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.laplace.levenberg_marquardt import descend
+from sipe_bayes.inference.laplace.options import ContactTuning
 from sipe_bayes.inference.laplace.screening import screen
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.laplace.windows.energy import (
@@ -35,6 +38,7 @@ from sipe_bayes.inference.laplace.windows.energy import (
     WindowEnergy,
     WindowPoint,
     beyond_start_noise,
+    judging_channels,
     present_noise,
 )
 from sipe_bayes.likelihood.noise import NORMAL_MAD, Noise
@@ -52,14 +56,16 @@ class _Plan:
     Args:
         horizons: their control steps.
         widest: differences at first, of the cube.
-        attempts: how often the search begins anew while more than the starts' noise is left.
+        attempts: screenings of candidates while none fits.
         robust: whether the first go downhill by Student's t before.
+        judges: whether the noise of the known starts tells when a place fits.
     """
 
     horizons: tuple[int, ...]
     widest: float
     attempts: int
     robust: bool
+    judges: bool
 
     @classmethod
     def of(cls, problem: SearchProblem, windows: Windows) -> _Plan | None:
@@ -69,10 +75,11 @@ class _Plan:
             horizons = [1]
             while horizons[-1] < longest:
                 horizons.append(min(longest, math.ceil(tuning.growth * horizons[-1])))
-            return cls(tuple(horizons), tuning.widest, tuning.attempts, robust=True)
+            judges = bool(judging_channels(windows).any())
+            return cls(tuple(horizons), tuning.widest, tuning.attempts, robust=True, judges=judges)
         if windows.num_start or not isinstance(windows.simulator, Simulator) or longest < tuning.long:
             return None
-        return cls(tuple(int(longest * 2.0 ** (k / 2)) for k in range(-8, 0)), 0.0, 1, robust=False)
+        return cls(tuple(int(longest * 2.0 ** (k / 2)) for k in range(-8, 0)), 0.0, 1, robust=False, judges=False)
 
 
 @dataclass(frozen=True)
@@ -82,14 +89,19 @@ class _Rest:
     Args:
         theta: (N,).
         misfit: what it minimises there.
-        sd: (N,), of theta.
-        fits: whether no more is left than the noise of the known starts.
+        covariance: (N, N), of theta.
+        fits: whether no more is left than the noise of the known starts; not where that is unknown.
     """
 
     theta: FloatArray
     misfit: float
-    sd: FloatArray
+    covariance: FloatArray
     fits: bool
+
+    @property
+    def sd(self) -> FloatArray:
+        """(N,), of theta."""
+        return np.sqrt(np.diag(self.covariance))
 
     def holds(self, other: _Rest) -> bool:
         """Whether another search came to rest in the same place."""
@@ -128,75 +140,190 @@ def starting_points(problem: SearchProblem, windows: Windows) -> FloatArray:
 def grown_starts(problem: SearchProblem, windows: Windows) -> FloatArray | None:
     """Starting points (R, N), the best first.
 
-    None where windows are searched as they are, the budget is too small, or all diverge. The search begins anew from
-    other candidates where the best one leaves more than the noise of the known starts.
+    None where windows are searched as they are, the budget is too small, or all diverge.
     """
     plan = _Plan.of(problem, windows)
     if plan is None:
         return None
     options, tuning = problem.options, problem.options.tuning.contact
-    limit, rests = windows.rollouts + tuning.budget_share * (windows.budget - windows.rollouts), list[_Rest]()
-    generator = torch.Generator().manual_seed(problem.seed)
-    for _ in range(plan.attempts):
-        new, whole = _attempt(problem, windows, plan, limit, generator)
-        for one in new if whole or not rests else []:
-            rests = _with(rests, one)
-        if not whole or (rests and rests[0].fits):
-            break
+    growth = _Growth.of(problem, windows, plan)
+    rests, whole = growth.in_turn() if plan.judges else (growth.together(growth.first_rests()), True)
+    if not whole:
+        rests = growth.together(rests)
     hopeless = tuning.hopeless * windows.observed.sum()
     kept = [rest.theta for rest in rests[: options.restarts] if rest.misfit < rests[0].misfit + hopeless]
     return np.stack(kept) if kept else None
 
 
-def _attempt(
-    problem: SearchProblem, windows: Windows, plan: _Plan, limit: float, generator: torch.Generator
-) -> tuple[list[_Rest], bool]:
-    """Where searches from some candidates come to rest, the best first, and whether all beginnings were fitted."""
-    rests, first = list[_Rest](), plan.horizons[0]
-    widest = np.full(windows.num_theta, plan.widest)
-    try:
-        for point in _screened(problem, windows, first, limit, generator):
-            if not plan.robust:
-                rests = _with(rests, _rest(problem, windows, first, limit, point, widest))
+@dataclass(frozen=True)
+class _Growth:
+    """Searches on beginnings that grow, within a limit of rollouts."""
+
+    problem: SearchProblem
+    windows: Windows
+    plan: _Plan
+    begun: int
+    generator: torch.Generator
+
+    @classmethod
+    def of(cls, problem: SearchProblem, windows: Windows, plan: _Plan) -> _Growth:
+        """One that has not begun."""
+        return cls(problem, windows, plan, windows.rollouts, torch.Generator().manual_seed(problem.seed))
+
+    @property
+    def tuning(self) -> ContactTuning:
+        """How it is done."""
+        return self.problem.options.tuning.contact
+
+    @property
+    def used(self) -> float:
+        """Share of the budget that is spent."""
+        return (self.windows.rollouts - self.begun) / max(self.windows.budget - self.begun, 1)
+
+    def in_turn(self) -> tuple[list[_Rest], bool]:
+        """One candidate after the other on ever longer beginnings, each as long as it fits.
+
+        Returns:
+            Where those that fit to the end do so, the best first, or else where the one ends that fits longest; and
+            whether any fits at all.
+        """
+        tuning, chains, first = self.tuning, list[list[_Rest]](), list[_Rest]()
+        fitting = list[_Rest]()
+        try:
+            for _ in range(self.plan.attempts):
+                for point in self._screened():
+                    rest = self._first(point)
+                    if rest is None or any(one.holds(rest) for one in first):
+                        continue
+                    first = _with(first, rest)
+                    chains.append(self._followed(rest) if rest.fits else [rest])
+                    fitting = _with(fitting, chains[-1][-1] if self._whole(chains[-1]) else None)
+                    if fitting and self.used > tuning.fitting_share:
+                        return fitting, True
+                if fitting or self.used > tuning.first_share:
+                    break
+        except BudgetExhausted:
+            pass
+        longest = max(chains, key=_reach, default=[])
+        return fitting or (longest[-1:] if len(longest) > 1 else first), len(longest) > 1
+
+    def first_rests(self) -> list[_Rest]:
+        """Where searches from candidates end on the first beginnings, the best first."""
+        rests = list[_Rest]()
+        try:
+            for point in self._screened():
+                rests = _with(rests, self._first(point))
+        except BudgetExhausted:
+            pass
+        return rests
+
+    def together(self, rests: list[_Rest]) -> list[_Rest]:
+        """Where the better half of the rests end on ever longer beginnings, until the budget ends."""
+        try:
+            for horizon in self.plan.horizons[1:]:
+                before, after = rests[: max(self.problem.options.restarts, len(rests) // 2)], list[_Rest]()
+                for one in before:
+                    after = _with(after, self._longer(one, horizon))
+                rests = after
+        except BudgetExhausted:
+            pass
+        return rests
+
+    def _first(self, point: FloatArray) -> _Rest | None:
+        """Where a search from a candidate (N,) ends on the first beginning."""
+        widest, horizon = np.full(len(point), self.plan.widest), self.plan.horizons[0]
+        if not self.plan.robust:
+            return self._rest(horizon, point, widest)
+        robust = self._rest(horizon, point, widest, robust=True)
+        return None if robust is None else self._rest(horizon, robust.theta, np.minimum(robust.sd, widest))
+
+    def _longer(self, rest: _Rest, horizon: int) -> _Rest | None:
+        """Where a search from a rest ends on longer beginnings."""
+        return self._rest(horizon, rest.theta, np.minimum(rest.sd, self.plan.widest))
+
+    def _followed(self, first: _Rest) -> list[_Rest]:
+        """From a rest on the first beginnings to one on the longest, or to the first that does not fit.
+
+        An impact that is missed may bring hardly any misfit, until beginnings are longer. So there are searches from
+        around each rest as well; one that comes to a better place is followed instead.
+        """
+        chain = self._straight([first])
+        try:
+            for number in range(self.tuning.nearby):
+                if self._whole(chain) and (number or self.used > self.tuning.nearby_share):
+                    break
+                chain = self._beside(chain)
+        except BudgetExhausted:
+            pass
+        return chain
+
+    def _beside(self, chain: list[_Rest]) -> list[_Rest]:
+        """The chain, or one that leaves it for a better place.
+
+        Raises:
+            BudgetExhausted: where the budget ends.
+        """
+        for k in range(1, len(chain)):
+            before = chain[k - 1]
+            normal = torch.randn(len(before.theta), generator=self.generator, dtype=torch.float64).numpy()
+            moved = before.theta + self.tuning.away * np.linalg.cholesky(before.covariance) @ normal
+            widths = np.minimum(before.sd, self.plan.widest)
+            other = self._rest(self.plan.horizons[k], np.clip(moved, 0.0, 1.0), widths)
+            if other is None or other.misfit > chain[k].misfit - 1 or chain[k].holds(other):
                 continue
-            robust = _rest(problem, windows, first, limit, point, widest, robust=True)
-            if robust is not None:
-                widths = np.minimum(robust.sd, widest)
-                rests = _with(rests, _rest(problem, windows, first, limit, robust.theta, widths))
-        for horizon in plan.horizons[1:]:
-            before, after = rests[: max(problem.options.restarts, len(rests) // 2)], list[_Rest]()
-            for one in before:
-                widths = np.minimum(one.sd, widest)
-                after = _with(after, _rest(problem, windows, horizon, limit, one.theta, widths))
-            rests = after
-    except BudgetExhausted:
-        return rests, False
-    return rests, True
+            onward = self._straight([*chain[:k], other])
+            if _reach(onward) > _reach(chain):
+                return onward
+        return chain
+
+    def _straight(self, chain: list[_Rest]) -> list[_Rest]:
+        """The chain with what follows its last rest, as long as that fits and the budget lasts."""
+        chain = list(chain)
+        try:
+            while len(chain) < len(self.plan.horizons) and chain[-1].fits:
+                rest = self._longer(chain[-1], self.plan.horizons[len(chain)])
+                if rest is None:
+                    break
+                chain.append(rest)
+        except BudgetExhausted:
+            pass
+        return chain
+
+    def _whole(self, chain: list[_Rest]) -> bool:
+        """Whether it fits to the end."""
+        return len(chain) == len(self.plan.horizons) and chain[-1].fits
+
+    def _rest(self, horizon: int, theta: FloatArray, widths: FloatArray, robust: bool = False) -> _Rest | None:
+        limit = self.begun + self.tuning.budget_share * (self.windows.budget - self.begun)
+        return _rest(self.problem, self.windows, horizon, limit, theta, widths, robust)
+
+    def _screened(self) -> FloatArray:
+        """The best (S, N) of the model as given and draws of the prior, by the first beginnings.
+
+        Raises:
+            BudgetExhausted: where the budget ends.
+        """
+        tuning, count, windows = self.tuning, self.problem.options.candidates, self.windows
+        count = max(count, tuning.candidates) if count else 0
+        draws = self.problem.prior.sample((count,), generator=self.generator).numpy()
+        points = np.concatenate([self.problem.space.default_theta[None], draws])
+        limit = self.begun + tuning.budget_share * (windows.budget - self.begun)
+        view, share = _beginning(windows, self.plan.horizons[0], limit)
+        residual, valid = view.residuals(points, np.tile(view.no_starts(), (len(points), 1, 1)))
+        windows.rollouts += math.ceil(view.rollouts * share)
+        misfits = [_misfit(view, one) if good else np.inf for one, good in zip(residual, valid, strict=True)]
+        return points[np.argsort(misfits, kind="stable")[: min(tuning.followed, int(valid.sum()))]]
+
+
+def _reach(chain: list[_Rest]) -> tuple[int, float]:
+    """Of two chains the better one's is larger."""
+    return len(chain), -chain[-1].misfit
 
 
 def _with(rests: list[_Rest], new: _Rest | None) -> list[_Rest]:
     """The rests with a new one, the best first, of those in one place the best alone."""
     every = sorted(rests if new is None else [*rests, new], key=lambda rest: rest.misfit)
     return [one for k, one in enumerate(every) if not any(better.holds(one) for better in every[:k])]
-
-
-def _screened(
-    problem: SearchProblem, windows: Windows, horizon: int, limit: float, generator: torch.Generator
-) -> FloatArray:
-    """The best (S, N) of the model as given and draws of the prior, by the first control steps of every window.
-
-    Raises:
-        BudgetExhausted: where the budget ends.
-    """
-    tuning, count = problem.options.tuning.contact, problem.options.candidates
-    count = max(count, tuning.candidates) if count else 0
-    draws = problem.prior.sample((count,), generator=generator).numpy()
-    points = np.concatenate([problem.space.default_theta[None], draws])
-    view, share = _beginning(windows, horizon, limit)
-    residual, valid = view.residuals(points, np.tile(view.no_starts(), (len(points), 1, 1)))
-    windows.rollouts += math.ceil(view.rollouts * share)
-    misfits = [_misfit(view, one) if good else np.inf for one, good in zip(residual, valid, strict=True)]
-    return points[np.argsort(misfits, kind="stable")[: min(tuning.followed, int(valid.sum()))]]
 
 
 def _rest(
@@ -237,8 +364,7 @@ def _rest(
                 size, damping = np.maximum(size / tuning.finer, least), rule.first
     finally:
         windows.rollouts += math.ceil(view.rollouts * share)
-    fits = beyond_start_noise(view, present_noise(view, residual).sd) is None
-    return _Rest(theta, _misfit(view, residual), np.sqrt(np.diag(covariance)), fits)
+    return _Rest(theta, _misfit(view, residual), covariance, _fits(view, residual))
 
 
 def _beginning(windows: Windows, horizon: int, limit: float) -> tuple[Windows, float]:
@@ -262,6 +388,15 @@ def _linearised(
     lin = replace(lin, residual=root * lin.residual, jacobian=root[..., None] * lin.jacobian)
     energy = _WeighedEnergy(windows, Noise(sd, noise.tau), prior, root)
     return LinearisedWindows(energy, point, windows.moments(lin, white=True))
+
+
+def _fits(windows: Windows, residual: FloatArray) -> bool:
+    """Whether residuals (W, L, C) are no more than the noise of the known starts, and no larger in some windows."""
+    noise, observed = present_noise(windows, residual), windows.observed
+    if not judging_channels(windows).any() or beyond_start_noise(windows, noise.sd) is not None:
+        return False
+    parts = [row[seen] for row, seen in zip(residual / noise.sd, observed, strict=True) if seen.sum() > 1]
+    return len(parts) < 2 or bool(bartlett(*parts).pvalue > THRESHOLDS.start_noise)
 
 
 def _misfit(windows: Windows, residual: FloatArray) -> float:

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.stats import chi2
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.laplace.levenberg_marquardt import Descent, QuadraticModel
 from sipe_bayes.inference.laplace.options import WindowTuning
@@ -187,17 +187,24 @@ def start_noise(windows: Windows) -> FloatArray:
     return out
 
 
+def judging_channels(windows: Windows) -> BoolArray:
+    """Of which windows and channels (W, C) a measurement of a known start tells noise."""
+    noise = start_noise(windows)
+    known = np.isfinite(noise) & np.isnan(windows.fixed_sd)
+    size = np.sqrt(np.where(known, noise**2, 0.0).sum(0) / np.maximum(known.sum(0), 1))
+    return np.asarray(known & (size > 1e-3 * np.maximum(windows.spread, 1e-300)))
+
+
 def beyond_start_noise(windows: Windows, sd: FloatArray) -> float | None:
     """How many times noise sds (C,) are the noise of the measurements of known starts; None where no more than it.
 
     A thousandth of a channel's spread is no matter, whatever the noise of the starts; of channels whose noise there is
     less, as in simulations without noise, nothing is asked.
     """
-    noise, spread = start_noise(windows), np.maximum(windows.spread, 1e-300)
-    known = np.isfinite(noise) & np.isnan(windows.fixed_sd)
-    known &= np.sqrt(np.where(known, noise**2, 0.0).sum(0) / np.maximum(known.sum(0), 1)) > 1e-3 * spread
+    noise, known = start_noise(windows), judging_channels(windows)
     if not known.any():
         return None
+    spread = np.maximum(windows.spread, 1e-300)
     share = np.where(known, noise**2 + (1e-3 * spread) ** 2, 0.0) / np.maximum(sd, 1e-300) ** 2
     count, total = int(known.sum()), float(share.sum())
     return float(np.sqrt(count / total)) if chi2.cdf(total, count) < THRESHOLDS.start_noise else None
