@@ -203,8 +203,8 @@ class Code(Enum):
         "than its nearest neighbours, and the search may have missed a better place; compare with npe or bayessim"
     )
     BEYOND_START_NOISE = blocking(
-        "simulations leave {times:.1f} times the noise that the measurements of their known starts have: the search "
-        "ended in a wrong valley, or the model lacks something; give a larger budget and more restarts"
+        "simulations leave in {which} windows {times:.1f} times the noise measurements of their known starts have: "
+        "the search ended in a wrong valley, or the model lacks something; give a larger budget and more restarts"
     )
     NOT_LOOKED_AROUND = blocking(
         "the budget left no room to look around the optimum: where contact is rough, the intervals may be too narrow; "

@@ -105,6 +105,7 @@ def wild_residuals(windows: Windows, residual: FloatArray) -> IntArray:
             first, past = np.searchsorted(log, [number, number + 1])
             own, rows = at[(at >= first) & (at < past)] - first, series[first:past, None]
             edges = np.flatnonzero(np.diff(sequence.window[first:past]))  # there a start of its own moves a residual
+            own = own if windows.num_start else np.setdiff1d(own, edges)  # to nought, from a known one
             wild[first:past] = _away(rows, own, WILD.longest, edges)
             own, longest = sudden[(sudden >= first) & (sudden < past)] - first, int(WILD.longest_share * len(rows))
             wild[first:past] |= _away(rows, own, max(longest, WILD.longest))

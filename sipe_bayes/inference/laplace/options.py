@@ -94,12 +94,15 @@ class ContactTuning(Options):
     enough: float = option(1e-3, "gain of a step below which nothing is", "of the energy", above=0)
     most_steps: int = option(40, "steps on one beginning", least=1)
     hopeless: float = option(0.1, "how much worse a place is that is left aside", "nats of a sample", above=0)
-    attempts: int = option(4, "screenings of candidates while more than the starts' noise is left", least=1)
+    hops: int = option(
+        60, "searches from far around the best place, while more than the starts' noise is left", least=0
+    )
+    far: float = option(8.0, "how far: beyond several jumps", "sds", above=0)
     nearby: int = option(6, "further searches on longer beginnings, from around a place that fits", least=0)
     away: float = option(3.0, "how far around: beyond the next jump", "sds", above=0)
     nearby_share: float = option(0.3, "of the budget: then there are none", above=0)
     fitting_share: float = option(0.15, "of the budget: then no more candidates are followed once one fits", above=0)
-    first_share: float = option(0.35, "of the budget: then no more candidates are screened, if none fits", above=0)
+    first_share: float = option(0.45, "of the budget: then there are no more of these", above=0)
     budget_share: float = option(0.6, "of the budget in all: the rest is the search's", above=0, below=1)
     long: int = option(256, "control steps from which a log on which nothing touches is fitted so as well", least=32)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import bartlett, chi2
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.thresholds import THRESHOLDS
@@ -193,6 +193,22 @@ def judging_channels(windows: Windows) -> BoolArray:
     known = np.isfinite(noise) & np.isnan(windows.fixed_sd)
     size = np.sqrt(np.where(known, noise**2, 0.0).sum(0) / np.maximum(known.sum(0), 1))
     return np.asarray(known & (size > 1e-3 * np.maximum(windows.spread, 1e-300)))
+
+
+def unevenly_left(windows: Windows, residual: FloatArray) -> float | None:
+    """How many times the middle window's is what a residual (W, L, C) leaves in the worst; None where no more.
+
+    Of windows from known starts whose noise is told: one that misses an impact is left with more than the others, by
+    M. S. Bartlett's test (1937, "Properties of Sufficiency and Statistical Tests", Proc. R. Soc. A 160). Residuals
+    scaled by channel have to be white.
+    """
+    noise = present_noise(windows, residual)
+    scaled = zip(residual / np.maximum(noise.sd, 1e-300), windows.observed, strict=True)
+    parts = [own[seen] for own, seen in scaled if seen.sum() > 1]
+    if len(parts) < 2 or not judging_channels(windows).any() or bartlett(*parts).pvalue > THRESHOLDS.start_noise:
+        return None
+    sizes = [float(np.sqrt((part**2).mean())) for part in parts]
+    return max(sizes) / max(float(np.median(sizes)), 1e-300)
 
 
 def beyond_start_noise(windows: Windows, sd: FloatArray) -> float | None:

@@ -10,6 +10,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.laplace.strategy import SearchProblem
+from sipe_bayes.inference.laplace.windows.contact_starts import begins_in_contact
 from sipe_bayes.inference.laplace.windows.energy import (
     WindowEnergy,
     beyond_rounding,
@@ -18,6 +19,7 @@ from sipe_bayes.inference.laplace.windows.energy import (
     misfit,
     noise_at_least,
     pulls,
+    unevenly_left,
     updated_noise,
 )
 from sipe_bayes.inference.laplace.windows.growing_windows import grows, level
@@ -215,6 +217,7 @@ def judged(
     unsmooth, gain, off = ending.tells and ending.refused > most, ending.refused, optimum.mean - ending.theta
     if windows.num_start and sandwiches(windows):  # in nats of its own width
         gain = 0.5 * float(off @ np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) @ off)
+    may_be_uneven = begins_in_contact(windows) and bool(np.median(ending.noise.tau) < windows.simulator.dt)
     if ending.cut_short and not ending.settled:
         reason = finding(Code.SEARCH_CUT_SHORT)
     elif not ending.settled:
@@ -222,7 +225,9 @@ def judged(
     elif unsmooth and gain > most:
         reason = finding(Code.NOT_SMOOTH, gain=gain)
     elif (times := beyond_start_noise(windows, optimum.sd)) is not None:
-        reason = finding(Code.BEYOND_START_NOISE, times=times)
+        reason = finding(Code.BEYOND_START_NOISE, times=times, which="all")
+    elif may_be_uneven and (times := unevenly_left(windows, ending.residual)) is not None:
+        reason = finding(Code.BEYOND_START_NOISE, times=times, which="some")
     if around is not None:
         covariance = around.covariance
         reason = finding(Code.ROUGH_EVERYWHERE) if around.rough else reason
