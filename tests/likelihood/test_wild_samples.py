@@ -113,6 +113,18 @@ def test_where_a_short_last_window_starts_is_not_wild_and_what_jumps_within_one_
     assert wild_residuals(windows, residual).tolist() == [[0, 99, 0]]
 
 
+def test_what_a_known_start_ends_is_not_wild() -> None:
+    """A simulation that missed an impact is off until the next window begins, at a state that is known."""
+    simulator = pendulums.pendulum()
+    recorded = Trajectories.stack([pendulums.log(simulator, [0.6, 0.08], 3, steps=100)])
+    known = replace(recorded, states=np.zeros((1, 101, simulator.default_state().size)))
+    for likelihood, logs, wild in ((Segments(0.04, starts="recorded"), known, 0), (Segments(0.04), recorded, 3)):
+        windows = Windows(likelihood, simulator, logs)
+        residual = np.random.default_rng(0).normal(0, 1e-3, windows.observed.shape)
+        residual[5, 1:4] += 3.0
+        assert len(wild_residuals(windows, residual * windows.observed)) == wild
+
+
 @pytest.mark.parametrize(("share", "size"), [(0.005, 0.15), (0.003, 20.0)])
 def test_a_fit_is_as_good_without_wild_samples(share: float, size: float) -> None:
     """Intervals as wide to 5 %, and where they were to .3 sd: what half a percent of the samples says."""

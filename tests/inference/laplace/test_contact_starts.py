@@ -14,7 +14,12 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets import acting
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.windows.contact_starts import begins_in_contact, grown_starts
-from sipe_bayes.inference.laplace.windows.energy import beyond_start_noise, present_noise, start_noise
+from sipe_bayes.inference.laplace.windows.energy import (
+    beyond_start_noise,
+    present_noise,
+    start_noise,
+    unevenly_left,
+)
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
 from tests.problems.bouncing import bouncing, bouncing_log
@@ -68,6 +73,34 @@ def test_the_noise_of_known_starts_tells_a_wrong_valley() -> None:
     assert right is None
     assert wrong is not None
     assert wrong > 2
+
+
+def test_windows_that_are_left_with_more_than_others_are_seen() -> None:
+    """Where one of ten is left with half as much again; where all are alike (by chance one log in a thousand) none."""
+    simulator, theta, log, likelihood = running(0)
+    windows = Windows(likelihood, simulator, log)
+    residual = windows.residuals(theta[None], windows.no_starts()[None])[0][0]
+    assert unevenly_left(windows, residual) is None
+    residual[3] *= 1.5
+    times = unevenly_left(windows, residual)
+    assert times is not None
+    assert 1.2 < times < 2.0
+
+
+def test_one_candidate_that_fits_to_the_end_is_enough() -> None:
+    """A fifth of a budget of 1000 leads to the truth; following several together takes a third."""
+    used = []
+    for seed in range(3):
+        simulator, theta, log, likelihood = running(seed)
+        windows = Windows(likelihood, simulator, log)
+        windows.budget = 1000
+        points = grown_starts(Laplace(simulator, likelihood=likelihood, seed=seed).problem, windows)
+        assert points is not None
+        error = np.abs(points[0] - theta).max()
+        used.append(windows.rollouts)
+        print(seed, error, used)
+        assert error < 5e-3
+    assert sum(used) < 750
 
 
 def test_what_a_search_leaves_beyond_it_blocks() -> None:
