@@ -9,12 +9,9 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-from filelock import FileLock, Timeout
 
 from sipe_bayes.benchmark import bank
 from sipe_bayes.benchmark.bank import Bank
@@ -25,9 +22,8 @@ from sipe_bayes.benchmark.measurement import Measurement
 from sipe_bayes.benchmark.records import Record, plan, posterior_path, record_path
 from sipe_bayes.benchmark.run_log import Run, read_runs, write_runs
 from sipe_bayes.benchmark.transfer.study import TransferRecord
-from sipe_bayes.core.files import OutputError, not_a_file, write_bytes
+from sipe_bayes.core.files import OutputError, exclusive, write_bytes
 
-_LOCK = ".lock"
 Report = Callable[[str], None]
 AnyMeasurement = Measurement[Record] | Measurement[TransferRecord]
 
@@ -70,7 +66,7 @@ def run(cells: Sequence[Cell], order: Order, kind: AnyMeasurement | None = None)
     if kind is None:
         return run(cells, order, ESTIMATES)
     folder = order.folder
-    with claimed(folder):
+    with exclusive(folder):
         left = without_record(cells, order, kind)
         estimates = {e.id: e for cell in left if (e := kind.needs(cell)) is not None}
         first = without_record(list(estimates.values()), order, ESTIMATES)
@@ -109,30 +105,11 @@ def simulate(which: Bank, budget: int, order: Order) -> int:
     Raises:
         OutputError: as ``run``.
     """
-    with claimed(order.folder):
+    with exclusive(order.folder):
         units = bank.shards(which, budget, bank.place(which, order.folder))
         if units:
             _carried_out(units, order)
         return len(units)
-
-
-@contextmanager
-def claimed(folder: Path) -> Iterator[None]:
-    """The folder, made if need be, for one run at a time; raises OutputError where another one is at work."""
-    not_a_file(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / _LOCK).touch()  # where it can not be written, the error names it
-    lock = FileLock(folder / _LOCK)
-    try:
-        lock.acquire(blocking=False)
-    except Timeout:
-        raise OutputError(
-            f"--out {folder}: another run is at work in it; wait for it, or choose another folder"
-        ) from None
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def without_record(cells: Sequence[Cell], order: Order, kind: AnyMeasurement) -> list[Cell]:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from sipe_bayes.calibration.output import claim
+from sipe_bayes.calibration.output import claimed
 from sipe_bayes.calibration.study import Study
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import FileError, read_arrays, reading, replacing, to_json, write_bytes, write_text
@@ -177,30 +177,30 @@ def run(
         early: whether it ends as soon as the posteriors are clearly wrong.
 
     Raises:
-        ValueError: where the folder holds another check, or fewer than 20 logs could be fitted.
+        ValueError: where the folder holds another check, one is at work in it, or fewer than 20 logs could be fitted.
     """
     whole("truths", truths, FEWEST)
     identity = study.identity()
-    claim(folder, identity, IDENTITY, sorted(identity), "check")
-    worker = _Worker(study, folder, tell)
-    fits, ranks = list[Fit](), list[FloatArray]()
-    for number in range(truths):
-        path = folder / FITS / f"{number:05d}.npz"
-        fit = Fit.load(path)
-        if fit is None:
-            tell(f"{study.method}: log {number + 1} of {truths}{_left(fits, truths)}", number, truths)
-            fit = worker.fit(number)
-            fit.save(path)
-        fits.append(fit)
-        if not fit.error:
-            ranks.append(mass_below(fit.draws, fit.truth, np.random.default_rng([study.seed, 6, number])))
-        if early and len(ranks) >= FEWEST and clearly_wrong(np.stack(ranks)):
-            break
-    result = replace(compare(study, fits), spared=truths - len(fits))
-    write_bytes(folder / "ranks.png", png(rank_check(result.check)))
-    write_bytes(folder / "coverage.png", png(coverage_curve(result.check)))
-    write_text(folder / RESULT, to_json(result.to_dict(), indent=2))
-    return result
+    with claimed(folder, identity, IDENTITY, sorted(identity), "check"):
+        worker = _Worker(study, folder, tell)
+        fits, ranks = list[Fit](), list[FloatArray]()
+        for number in range(truths):
+            path = folder / FITS / f"{number:05d}.npz"
+            fit = Fit.load(path)
+            if fit is None:
+                tell(f"{study.method}: log {number + 1} of {truths}{_left(fits, truths)}", number, truths)
+                fit = worker.fit(number)
+                fit.save(path)
+            fits.append(fit)
+            if not fit.error:
+                ranks.append(mass_below(fit.draws, fit.truth, np.random.default_rng([study.seed, 6, number])))
+            if early and len(ranks) >= FEWEST and clearly_wrong(np.stack(ranks)):
+                break
+        result = replace(compare(study, fits), spared=truths - len(fits))
+        write_bytes(folder / "ranks.png", png(rank_check(result.check)))
+        write_bytes(folder / "coverage.png", png(coverage_curve(result.check)))
+        write_text(folder / RESULT, to_json(result.to_dict(), indent=2))
+        return result
 
 
 def _left(fits: list[Fit], truths: int) -> str:

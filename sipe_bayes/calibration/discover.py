@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sipe_bayes.calibration.discovered import write_discovery
 from sipe_bayes.calibration.discovery_summary import summarise
-from sipe_bayes.calibration.output import CHECKPOINT, IDENTITY, claim, describe_run, release
+from sipe_bayes.calibration.output import CHECKPOINT, IDENTITY, claimed, describe_run
 from sipe_bayes.calibration.problem import Problem, prepare
 from sipe_bayes.calibration.run import run_name
 from sipe_bayes.diagnostics.discovery import Discovery
@@ -131,8 +131,7 @@ def run_discovery(
         "without": list(restriction.without),
         "extensions_sha256": restriction.digests,
     }
-    claim(folder, {**record, "status": "started"}, keys=_KEYS)
-    try:
+    with claimed(folder, {**record, "status": "started"}, keys=_KEYS):
         structures = discover(
             problem,
             only=only,
@@ -142,13 +141,10 @@ def run_discovery(
             checkpoint=folder / CHECKPOINT,
             progress=progress,
         )
-    except ValueError:
-        release(folder)
-        raise
 
-    def tell(what: str) -> None:
-        if progress is not None:
-            progress(f"comparing before and after: {what}", structures.rollouts, structures.rollouts)
+        def tell(what: str) -> None:
+            if progress is not None:
+                progress(f"comparing before and after: {what}", structures.rollouts, structures.rollouts)
 
-    discovery = summarise(problem, structures, name, chosen, began, tell)
-    return write_discovery(replace(discovery, run=record, out=str(folder)), structures, problem, folder)
+        discovery = summarise(problem, structures, name, chosen, began, tell)
+        return write_discovery(replace(discovery, run=record, out=str(folder)), structures, problem, folder)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,9 @@ import torch
 
 from sipe_bayes.calibration.problem import RUN, Problem
 from sipe_bayes.core.files import (
+    LOCK,
     OutputError,
+    exclusive,
     installed_version,
     not_a_file,
     read_json,
@@ -70,17 +73,13 @@ def _checksum(path: Path) -> str:
 IDENTITY = ("config_sha256", "model_sha256", "prior_sha256", "logs_sha256", "estimator", "seed", "budget")
 
 
-def release(folder: Path) -> None:
-    """Give back a folder that was claimed by a run that was refused before it had anything to keep."""
-    if not (folder / CHECKPOINT).exists() and [p.name for p in folder.iterdir()] == [RUN]:
-        (folder / RUN).unlink()
-        folder.rmdir()
-
-
-def claim(
+@contextmanager
+def claimed(
     folder: Path, own: Mapping[str, object], file: str = RUN, keys: Sequence[str] = IDENTITY, what: str = "run"
-) -> None:
-    """Make ``folder`` this run's own; the same run may come back to it.
+) -> Iterator[None]:
+    """Make ``folder`` this run's own while it is at work; the same run may come back to it.
+
+    It is given back where the run is refused before it has anything to keep.
 
     Args:
         folder: of the results.
@@ -90,8 +89,21 @@ def claim(
         what: the run is called.
 
     Raises:
-        OutputError: when it holds another run.
+        OutputError: when it holds another run, or one is at work in it.
     """
+    _claim(folder, own, file, keys, what)
+    with exclusive(folder):
+        try:
+            yield
+        except ValueError:
+            if {path.name for path in folder.iterdir()} == {file, LOCK}:
+                (folder / file).unlink()
+                (folder / LOCK).unlink()
+                folder.rmdir()
+            raise
+
+
+def _claim(folder: Path, own: Mapping[str, object], file: str, keys: Sequence[str], what: str) -> None:
     not_a_file(folder)
     record, content = folder / file, to_json(own, indent=2)
     if record.is_file():

@@ -28,9 +28,8 @@ from sipe_bayes.calibration.output import (
     CHECKS,
     IDENTITY,
     PACKAGES,
-    claim,
+    claimed,
     describe_run,
-    release,
     write_all,
 )
 from sipe_bayes.calibration.problem import Problem, method_of, prepare
@@ -227,13 +226,9 @@ def run(
     folder = Path("runs") / f"{run_name(problem.config.path)}-{name}" if out is None else out
     record = describe_run(problem, name, chosen_seed, chosen_budget)
     keys = [key for key in IDENTITY if key != "budget" or not estimator_class(name).goes_on]
-    claim(folder, {**record, "status": "started"}, keys=keys)
-    try:
+    with claimed(folder, {**record, "status": "started"}, keys=keys):
         calibration = calibrate(problem, name, chosen_seed, chosen_budget, folder / CHECKPOINT, progress)
-    except ValueError:
-        release(folder)
-        raise
-    calibration = replace(calibration, run=record, out=str(folder))
-    if progress is not None:
-        progress("writing the report", calibration.rollouts, calibration.rollouts)
-    return write_all(calibration, problem, folder)
+        calibration = replace(calibration, run=record, out=str(folder))
+        if progress is not None:
+            progress("writing the report", calibration.rollouts, calibration.rollouts)
+        return write_all(calibration, problem, folder)

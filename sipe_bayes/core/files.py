@@ -21,12 +21,16 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from filelock import FileLock, Timeout
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
 LOG_GIB, MODEL_GIB, MODEL_SECONDS = "SIPE_LOG_GIB", "SIPE_MODEL_GIB", "SIPE_MODEL_SECONDS"
 TRUST_MODELS, DATA = "SIPE_TRUST_MODELS", "SIPE_BAYES_DATA"
+LOCK = ".lock"
+"""What keeps a second run out of a folder of results."""
 LONGEST_TEXT = 2**25
 """Bytes of JSON or TOML: what it becomes in memory is twenty times as much."""
 LIMITS = {LOG_GIB: 1.0, MODEL_GIB: 4.0, MODEL_SECONDS: 20.0}
@@ -295,6 +299,25 @@ def not_a_file(folder: Path) -> None:
     """Raises OutputError where the folder to write into is a file."""
     if os.path.exists(folder) and not is_folder(folder):
         raise OutputError(f"--out {folder}: is a file, not a folder; choose another name")
+
+
+@contextmanager
+def exclusive(folder: Path) -> Iterator[None]:
+    """A folder of results, made if need be, for one run at a time; raises OutputError where another is at work."""
+    not_a_file(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / LOCK).touch()  # where it can not be written, the error names it
+    lock = FileLock(folder / LOCK)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise OutputError(
+            f"--out {folder}: another run is at work in it; wait for it, or choose another folder"
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def installed_version(package: str) -> str:

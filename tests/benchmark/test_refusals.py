@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from sipe_bayes.benchmark import measure, measurement, run
+from sipe_bayes.benchmark import measure, measurement
 from sipe_bayes.benchmark.cells import Cell
 from sipe_bayes.benchmark.measure import ESTIMATES
 from sipe_bayes.benchmark.records import Record
@@ -149,5 +149,5 @@ def test_a_cell_that_finds_the_disk_full_is_not_at_fault(
 
 
 def test_two_runs_at_once_are_refused(tmp_path: Path) -> None:
-    with run.claimed(tmp_path):
+    with files.exclusive(tmp_path):
         refused(measured(tmp_path, *PENDULUM), "another run is at work")

@@ -245,7 +245,7 @@ def of_state(path: Path, state: Any, read: Read) -> Change:
 def descriptions(folder: Path) -> Change:
     """Small files beside others: randomisation, card, counts, learning curve, facts, shards, a run's record."""
     from sipe_bayes.benchmark import bank
-    from sipe_bayes.calibration.output import claim
+    from sipe_bayes.calibration.output import claimed
     from sipe_bayes.rl.demonstrate import facts_of
     from sipe_bayes.rl.evaluation import read_card
     from sipe_bayes.rl.randomization import load_randomization
@@ -256,6 +256,11 @@ def descriptions(folder: Path) -> Change:
     counts = {"steps": 1, "updates": 1, "redrawn": 0, "diverged": 0, "asked": 1, "fingerprint": "x"}
     which = bank.Bank("Pendulum", "default", 0, 5)
     run = {"config_sha256": "a", "seed": 0}
+
+    def come_back() -> None:
+        with claimed(folder / "run", run, keys=tuple(run)):
+            pass
+
     kinds: dict[str, tuple[Any, Callable[[], object]]] = {
         "d.json": (
             {"parameters": [row], "covariance": [[0.01]], "observation_noise": 0.1, "action_delay": 1},
@@ -268,7 +273,7 @@ def descriptions(folder: Path) -> Change:
             {"bank": which.id, "cpu_seconds": 1.0},
             lambda: (bank.known_place(which, folder), bank.cost(folder / bank.FOLDER, "k")),
         ),
-        "run/run.json": (run, lambda: claim(folder / "run", run, keys=tuple(run))),
+        "run/run.json": (run, come_back),
     }
     columns = "step,return_mean,return_sd,success_rate,wall_seconds,updates_per_second"
     curve = f"{columns}\n1,0.5,0.1,,0.1,5.0\n2,0.7,0.2,0.5,0.2,5.0\n"
