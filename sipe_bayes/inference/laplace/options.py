@@ -98,6 +98,7 @@ class ContactTuning(Options):
         60, "searches from far around the best place, while more than the starts' noise is left", least=0
     )
     far: float = option(8.0, "how far: beyond several jumps", "sds", above=0)
+    told: float = option(0.2, "sd below which single control steps tell a parameter", "of the cube", above=0)
     nearby: int = option(6, "further searches on longer beginnings, from around a place that fits", least=0)
     away: float = option(3.0, "how far around: beyond the next jump", "sds", above=0)
     nearby_share: float = option(0.3, "of the budget: then there are none", above=0)

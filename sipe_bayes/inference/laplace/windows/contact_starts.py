@@ -4,11 +4,12 @@ A window's error is magnified by each impact, and the simulation jumps where one
 from the truth five control steps of a half-cheetah are off by five times the noise, at a tenth by twenty, with an
 optimum behind every jump. A single control step from a known state is nearly smooth, costs little and tells most.
 
-Where the noise of the known starts tells when a place fits, one candidate is followed after the other, from single
-control steps to whole windows, each as long as it fits: no more than that noise is left, and no more in some windows
-than in others. Searches from around its places leave its way where they come to better ones; and where no candidate
-fits at all, searches go on from far around the best. Else the best of many candidates go downhill on the first control
-step of all windows; the better half of the places where they come to rest on longer beginnings, and so on.
+Where the noise of the known starts tells when a place fits, and single control steps tell every parameter, one
+candidate is followed after the other, from single control steps to whole windows, each as long as it fits: no more than
+that noise is left, and no more in some windows than in others. Searches from around its places leave its way where they
+come to better ones; and where no candidate fits at all, searches go on from far around the best. Else the best of many
+candidates go downhill on the first control step of all windows; the better half of the places where they come to rest
+on longer beginnings, and so on.
 
 Single control steps go downhill twice, first by Student's t (K. L. Lange, R. J. A. Little, J. M. G. Taylor 1989,
 "Robust Statistical Modeling Using the t Distribution", JASA 84), which bears the few windows that are still beyond an
@@ -143,10 +144,11 @@ class _Growth:
         first, chains, fitting = list[Rest](), list[list[Rest]](), list[Rest]()
         try:
             for rest in self._candidates(first):
-                if rest is None or any(one.holds(rest) for one in first):
+                if rest is None or any(one.holds(rest) and one.misfit < rest.misfit + 1 for one in first):
                     continue
                 first[:] = _with(first, rest)
-                chains.append(self._followed(rest) if rest.fits else [rest])
+                told = rest.fits and rest.sd.max() < self.tuning.told  # else what fits is no place
+                chains.append(self._followed(rest) if told else [rest])
                 fitting = _with(fitting, chains[-1][-1] if self._whole(chains[-1]) else None)
                 if fitting and self.used > self.tuning.fitting_share:
                     break
