@@ -105,6 +105,7 @@ class ContactTuning(Options):
     fitting_share: float = option(0.15, "of the budget: then no more candidates are followed once one fits", above=0)
     first_share: float = option(0.45, "of the budget: then there are no more of these", above=0)
     budget_share: float = option(0.6, "of the budget in all: the rest is the search's", above=0, below=1)
+    anew_share: float = option(0.2, "of the budget, that has to be left to begin anew with", above=0)
     long: int = option(256, "control steps from which a log on which nothing touches is fitted so as well", least=32)
 
 

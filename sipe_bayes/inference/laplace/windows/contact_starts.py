@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -36,10 +36,13 @@ from sipe_bayes.inference.laplace.screening import screen
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.laplace.windows.beginnings import Rest, beginning, misfit_of, rest_on
 from sipe_bayes.inference.laplace.windows.energy import judging_channels
+from sipe_bayes.inference.laplace.windows.state import WindowState
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.contacts import may_touch
 from sipe_bayes.simulation.simulator import Simulator
+
+_ANEW = 1_000_003  # of the seed, to other candidates
 
 
 @dataclass(frozen=True)
@@ -107,6 +110,20 @@ def grown_starts(problem: SearchProblem, windows: Windows) -> FloatArray | None:
     hopeless = tuning.hopeless * windows.observed.sum()
     kept = [rest.theta for rest in rests[: options.restarts] if rest.misfit < rests[0].misfit + hopeless]
     return np.stack(kept) if kept else None
+
+
+def started_anew(problem: SearchProblem, windows: Windows, state: WindowState) -> FloatArray | None:
+    """Starting points (R, N) from other candidates, where the best optimum leaves more than the known starts' noise.
+
+    None where it does not, where starting points were given, or little of the budget is left.
+    """
+    best, tuning = max(state.optima, key=lambda optimum: optimum.evidence, default=None), problem.options.tuning
+    left = (windows.budget - windows.rollouts) / windows.budget
+    if best is None or not best.unexplained or problem.options.initial is not None:
+        return None
+    if left < tuning.contact.anew_share or len(state.points) >= tuning.windows.most_points:
+        return None
+    return grown_starts(replace(problem, seed=problem.seed + _ANEW * len(state.points)), windows)
 
 
 @dataclass(frozen=True)

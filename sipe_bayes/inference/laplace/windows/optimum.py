@@ -237,6 +237,7 @@ def judged(
         covariance = covariance + ending.bettered.covariance
     guessed = (ending.cut_short and not ending.settled) or (unsmooth and not windows.num_start)
     guessed = guessed or (around is not None and around.rough)
+    guessed = guessed or (reason is not None and reason.code is Code.BEYOND_START_NOISE)
     if guessed:
         left = misfit(windows, ending.residual) / ending.first_misfit
         way = float(np.sqrt(((ending.theta - ending.begin) ** 2).mean()))

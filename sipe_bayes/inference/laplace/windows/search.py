@@ -1,10 +1,10 @@
 """The search over windows, from starting point to recorded optimum, in phases.
 
-Simulations are what a fit costs, so they are spared where they add nothing. Where the log tells the windows' starts,
-theta moves alone first, on every other window, until a step gains little; not through contact, where starting points
-are at rest on all windows already. The Jacobian of the starts is kept as long as it foretells the gain of a step to a
-fifth; an optimum is only accepted where what was foretold since it was taken is wrong by less than half a nat. A later
-starting point is dropped once the search has all but come to an optimum that is already known.
+Where the log tells the windows' starts, theta moves alone first, on every other window, until a step gains little; not
+through contact, where starting points are at rest on all windows already. The Jacobian of the starts is kept as long as
+it foretells the gain of a step to a fifth; an optimum is only accepted where what was foretold since it was taken is
+wrong by less than half a nat. A later starting point is dropped once the search has all but come to an optimum that is
+already known. Where the best one leaves more than the noise of known starts, the search begins anew while it may.
 
 Where a direction is open (a ridge), the search goes on once from its middle, since the width across a ridge may differ
 from place to place, and the place would otherwise be an accident of the start.
@@ -41,7 +41,7 @@ from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.inference.laplace.levenberg_marquardt import Descent, descend
 from sipe_bayes.inference.laplace.options import LaplaceTuning
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.inference.laplace.windows.contact_starts import begins_in_contact, starting_points
+from sipe_bayes.inference.laplace.windows.contact_starts import begins_in_contact, started_anew, starting_points
 from sipe_bayes.inference.laplace.windows.energy import (
     LinearisedWindows,
     WindowEnergy,
@@ -157,6 +157,8 @@ class WindowSearch:
     def _next(self, state: WindowState) -> WindowState:
         """At the next starting point; after the last, groups of windows that tumble are fitted apart."""
         onward = state.next_point(self._begin)
+        if onward.done and (anew := started_anew(self.problem, self.windows, state)) is not None:
+            return replace(state, points=np.concatenate([state.points, anew])).next_point(self._begin)
         if onward.done and not state.scouted and state.optima and may_scout(self.problem, self.windows):
             return replace(state, here=replace(state.here, phase=Phase.SCOUT))
         if not (onward.done and grows(self.windows)) or not state.optima:
@@ -356,8 +358,7 @@ class WindowSearch:
         )
         optimum = widened(self.problem, windows, ending)
         afresh, stays = here.afresh(tuning.damping), here.centred or cut_short
-        further = None if stays else middle_of_ridge(self.problem, windows, optimum)
-        if further is not None:
+        if (further := None if stays else middle_of_ridge(self.problem, windows, optimum)) is not None:
             return replace(state, here=replace(afresh, theta=further, centred=True))
         searched = Noise(noise.sd, np.zeros(len(noise.sd))) if sandwiches(windows) else noise
         around = surroundings(self.problem, windows, theta, searched, optimum.covariance)

@@ -144,6 +144,11 @@ class WindowOptimum(Optimum):
         """Whether the simulation does not follow its slope there."""
         return self.finding is not None and self.finding.code is Code.NOT_SMOOTH
 
+    @property
+    def unexplained(self) -> bool:
+        """Whether simulations leave more there than the noise of known starts."""
+        return self.finding is not None and self.finding.code is Code.BEYOND_START_NOISE
+
 
 @dataclass(frozen=True)
 class WindowState(StrategyState[Position]):
@@ -167,12 +172,14 @@ class WindowState(StrategyState[Position]):
 
     @property
     def known(self) -> bool:
-        """Whether the search has come to one of the optima recorded earlier.
+        """Whether the search has come to one of the optima recorded earlier that explain the logs.
 
         In each principal direction of its normal within one sd, or within a tenth of the way that it had to come.
         """
         begin = self.points[self.point]
         for optimum in self.optima:
+            if optimum.unexplained:
+                continue
             eigenvalues, axes = np.linalg.eigh(optimum.covariance)
             sd = np.sqrt(eigenvalues)
             left = np.abs((self.here.theta - optimum.mean) @ axes) / sd
