@@ -149,6 +149,8 @@ def _named(effect: Effect) -> list[Probe]:
     what = "as a parameter (or widen its bounds)" if len(targets) == 1 else "as parameters (or widen their bounds)"
     by_log = any(parameter.log is not None for parameter in placed.parameters)
     remedy = f"add {' and '.join(targets)} {what}"
+    if placed.edit is not None:  # the model has no such part yet
+        remedy = f"let `sipe discover` put it in (--only {placed.extension.name})"
     probe = Probe(placed.sentence, remedy, by_log, placed.site, placed.extension)
     if effect.trades.any():
         sized = effect.trades / np.sqrt(_size(effect.change))[:, None]

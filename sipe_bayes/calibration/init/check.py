@@ -144,7 +144,9 @@ def _other_readings(changed: Sequence[tuple[Reading, Reading]], times: float) ->
         where = f"{'commands' if now.commanded else 'measurements'}, column {now.match.column!r}"
         more = f"fits the log: simulated windows miss {times:.2g} times as much with what stands there"
         if now.unit != then.unit:
-            out.append(f"{where}: unit {now.unit!r} is odd, {then.unit!r} {more}")
+            named = read_name(now.match.column).unit == now.unit
+            but = "; its name says what stands there, so the model may be as far off instead" if named else ""
+            out.append(f"{where}: unit {now.unit!r} is odd, {then.unit!r} {more}{but}")
         if now.sign != then.sign:
             out.append(f"{where}: sign {now.sign} is odd, {then.sign} {more}")
     return out

@@ -91,8 +91,12 @@ def decide(
 def _by_names(draft: Draft, asked: Sequence[Question]) -> Draft:
     """The draft as names have it, where simulations tell nothing."""
     text = "no simulation follows these logs better than a straight line does, so units and signs stand on names alone"
-    doubt = f"{text}; look at the model and at what drives it"
-    return _read_as(draft, answered(draft.readings, asked, named_answers(asked)), [*draft.doubts, doubt])
+    doubts = [*draft.doubts, f"{text}; look at the model and at what drives it"]
+    readings = answered(draft.readings, asked, named_answers(asked))
+    for number in dict.fromkeys(1 / r.factor for r in readings if r.scales and r.factor != 1):
+        names = ", ".join(repr(r.match.column) for r in readings if r.scales and r.factor == 1 / number)
+        doubts.append(f"{names}: {number:g} counts a turn is a guess; write what the encoder has")
+    return _read_as(draft, readings, doubts)
 
 
 def _read_as(draft: Draft, readings: Sequence[Reading], doubts: Sequence[str]) -> Draft:

@@ -184,10 +184,10 @@ def _surety(scores: FloatArray, i: int, j: int) -> float:
 
 
 def _by_position(positions: Sequence[Match], velocities: Sequence[Match], table: Table) -> list[Match]:
-    """Velocities exchanged among the joints where the slopes of positions tell so."""
+    """Velocities exchanged among the joints, and given to others, where the slopes of positions tell so."""
     places = {m.target.removesuffix("position"): table[m.column] for m in positions}
-    targets = [m.target for m in velocities]
-    scores = np.zeros((len(velocities), len(velocities)))
+    targets = list(dict.fromkeys([*(m.target for m in velocities), *(f"{place}velocity" for place in places)]))
+    scores = np.zeros((len(velocities), len(targets)))
     for i, match in enumerate(velocities):
         for j, target in enumerate(targets):
             place = places.get(target.removesuffix("velocity"))

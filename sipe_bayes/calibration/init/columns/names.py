@@ -20,6 +20,7 @@ from sipe_bayes.calibration.init.columns.vocabulary import (
     DUTIES,
     EPISODES,
     GREEK,
+    GYROS,
     LENGTHS,
     MEASURED,
     OF_NO_JOINT,
@@ -127,8 +128,9 @@ def read_name(column: str, own: Collection[str] = ()) -> Label:
     axis = _axis(words)
     if axis and kind in (Kind.POSITION, Kind.UNKNOWN) and _is_quaternion(words):
         kind = Kind.QUATERNION
-    angular = True if flags & {"angle"} or unit in ("rad", "deg", "rev", "mrad", "rpm", "rad/s", "deg/s") else None
-    angular = False if flags & {"length"} or unit in ("m", "mm", "cm", "um", "m/s", "mm/s", "N") else angular
+    turns = unit in ("rad", "deg", "rev", "mrad", "rpm", "rad/s", "deg/s", "rev/s") or bool(GYROS & {*words})
+    slides = unit in ("m", "mm", "cm", "um", "m/s", "mm/s", "N") or (bool(flags & {"length"}) and not turns)
+    angular = False if slides else True if turns or flags & {"angle"} else None
     number = numbers[-1] if numbers else None
     stem = column if number is None else re.sub(r"\d+(?=\D*$)", "#", column)
     vector = _without_axis(column, words[-1]) if axis else ""

@@ -15,6 +15,7 @@ ALONG, ABOUT = {"vx", "vy", "vz"}, {"wx", "wy", "wz", "gx", "gy", "gz"}  # veloc
 PUSHED = {"ax", "ay", "az"}  # accelerations of a body
 OF_BODIES = ALONG | ABOUT | PUSHED
 """Words with an axis, of velocities and accelerations."""
+GYROS = {"gyro", "gyros", "gyroscope", "omega"}
 SPEEDS = {"velocity", "velocities", "vel", "speed", "omega", "w", "qvel", "rate", "gyro", "v", "xv", "av"} | {
     "angvel", "drehzahl", "drehz", "geschwindigkeit",
 } | ALONG | ABOUT  # fmt: skip

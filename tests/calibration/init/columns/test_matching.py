@@ -131,6 +131,27 @@ def test_a_gyro_of_a_free_body(sensors: str, joint: str, target: str | None) -> 
     assert [m.column for m in matches.positions] == [joint] * bool(joint)
 
 
+def test_one_rate_of_a_gyro_is_the_joints_whose_slope_it_is() -> None:
+    """And no slide's, though its axis is called so; of two hinges the second, where positions tell."""
+    machine = Machine.of(
+        mujoco.MjModel.from_xml_string(
+            """<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0"/><joint name="wheel" axis="0 1 0"/>
+            <joint name="pitch" axis="0 1 0"/><geom size=".1" mass="1"/></body></worldbody></mujoco>"""
+        )
+    )
+    time = np.arange(0, 5, 0.01)
+    table = {
+        "wheel_rad": np.sin(3 * time),
+        "pitch_deg": 10 * np.sin(2 * time + 1),
+        "gyro_y_dps": 20 * np.cos(2 * time + 1),
+    }
+    (velocity,) = match_columns(machine, table).velocities
+    assert velocity.target == "joint:pitch.velocity"
+    assert velocity.label.unit == "deg/s"
+    (alone,) = match_columns(machine, {"gyro_y_dps": table["gyro_y_dps"]}).velocities
+    assert alone.target == "joint:wheel.velocity"
+
+
 BEAM = """<mujoco><worldbody><body name="beam"><joint name="tilt"/><geom size=".1" mass="1"/><body name="ball">
     <joint name="roll" type="slide"/><geom size=".1" mass="1"/></body></body></worldbody>
     <actuator><{kind} name="servo" joint="tilt"/></actuator></mujoco>"""
