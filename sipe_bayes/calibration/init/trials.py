@@ -170,7 +170,7 @@ class Trial:
         key = replace(assumption, delay=0, driven=(), actuators=(), rests=())
         if key not in self._read:
             logs = [_read_as(log, assumption) for log in self.logs]
-            states = [estimate_states(self.simulator, log)[s] for log, s in zip(logs, self.places, strict=True)]
+            states = [estimate_states(self.simulator, log, rows=s)[s] for log, s in zip(logs, self.places, strict=True)]
             cuts = [s[:, None] + np.arange(self.length + 1) for s in self.places]
             measured = np.concatenate([log.observations[cut] for log, cut in zip(logs, cuts, strict=True)])
             dt = np.concatenate([np.full(len(s), log.dt) for log, s in zip(logs, self.places, strict=True)])

@@ -26,6 +26,7 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 
 SD = 0.1  # rad or m, and ten times as much a second: how far from closed a window may start, a noisy crank included
 _STEP, _MOST, _TOLERANCE, _APART, _HARDLY = 0.05, 30, 1e-10, 1e-6, 1e-3
+_NEARER, _IN_VAIN = 0.9, 4  # of what a loop is open: steps that bring no less until it is given up
 _FOLDED = 0.02  # of the largest singular value, now or by the next sample as it goes
 _APPROACH = 40  # steps from the reset to the first sample, at least
 
@@ -71,9 +72,14 @@ class _Chain:
 
     def closed(self, position: FloatArray) -> FloatArray:
         """Positions (nq,) at which joints that nothing measures are moved so that the chain closes."""
-        out, way = position.copy(), np.zeros(self.model.nv)
+        out, way, least, vain = position.copy(), np.zeros(self.model.nv), np.inf, 0
         for _ in range(_MOST if len(self.dofs) else 0):
             residual, jacobian = self.at(out)
+            size = float(np.abs(residual).max(initial=0.0))
+            vain = 0 if size < _NEARER * least else vain + 1
+            least = min(least, size)
+            if vain == _IN_VAIN and size > _TOLERANCE:  # it can not be closed
+                break
             step = -np.linalg.lstsq(jacobian[:, self.dofs], residual, rcond=_APART)[0]
             way[self.dofs] = np.clip(step, -0.3, 0.3)
             mujoco.mj_integratePos(self.model, out, way, 1.0)

@@ -31,7 +31,9 @@ Followed: TypeAlias = dict[int, tuple[float, float]]  # sds of a start's positio
 STATE_STEP = 1e-5  # rad or m, rad/s or m/s: finite differences by a state
 
 
-def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = False) -> FloatArray:
+def estimate_states(
+    simulator: Simulator, trajectory: Trajectory, raw: bool = False, rows: IntArray | None = None
+) -> FloatArray:
     """A first guess of the states (T+1, S) along a log: recorded ones of such a model, else measured ones.
 
     Measured coordinates are smoothed by local quadratics over 60 ms, missing samples bridged, unmeasured velocities
@@ -44,13 +46,16 @@ def estimate_states(simulator: Simulator, trajectory: Trajectory, raw: bool = Fa
         simulator: of the model.
         trajectory: the log.
         raw: whether positions and measured velocities are those of the samples, not smoothed.
+        rows: samples, in order, at which alone closed chains are closed, which takes its time; default all.
     """
     if trajectory.states is not None and are_states(simulator, trajectory.states):
         return trajectory.states
-    return _estimated(simulator, trajectory, raw)[0]
+    return _estimated(simulator, trajectory, raw, rows)[0]
 
 
-def _estimated(simulator: Simulator, trajectory: Trajectory, raw: bool) -> tuple[FloatArray, set[int], Followed]:
+def _estimated(
+    simulator: Simulator, trajectory: Trajectory, raw: bool, rows: IntArray | None = None
+) -> tuple[FloatArray, set[int], Followed]:
     """States (T+1, S) along a log; and ids of the joints that channels tell indirectly, and those that follow."""
     model, states = simulator.model, np.tile(simulator.default_state(), (len(trajectory) + 1, 1))
     columns = simulator.environment.state_columns(model)
@@ -74,7 +79,10 @@ def _estimated(simulator: Simulator, trajectory: Trajectory, raw: bool) -> tuple
         _put_felt(simulator, {r.quantity: r for r in readings if r.joint == joint}, trajectory, states)
     known = measured_joints(simulator, np.asarray(np.isfinite(trajectory.observations).any(0)))
     indirect = _put_indirect(simulator, trajectory, states, known, measured, raw)
-    follow: Followed = dict.fromkeys(close(model, states, simulator.default_state(), known | indirect), (SD, 10 * SD))
+    rows = np.arange(len(states)) if rows is None else rows
+    some = states[rows]
+    follow: Followed = dict.fromkeys(close(model, some, simulator.default_state(), known | indirect), (SD, 10 * SD))
+    states[rows] = some
     unknown = set(range(model.njnt)) - known - indirect - set(follow)
     if unknown and may_touch(model) and not simulator.environment.stepwise:
         rates = [column for column in measured if column > model.nq]
