@@ -6,7 +6,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -91,32 +91,38 @@ def claimed(
     Raises:
         OutputError: when it holds another run, or one is at work in it.
     """
-    _claim(folder, own, file, keys, what)
-    with exclusive(folder):
-        try:
+    mine = False
+    _refuse(folder, own, file, keys, what)
+    try:
+        with exclusive(folder):
+            if not _refuse(folder, own, file, keys, what):
+                write_text(folder / file, to_json(own, indent=2))
+            mine = True
             yield
-        except ValueError:
-            if {path.name for path in folder.iterdir()} == {file, LOCK}:
+    except ValueError:
+        if mine and {path.name for path in folder.iterdir()} == {file, LOCK}:
+            with suppress(OSError):
                 (folder / file).unlink()
                 (folder / LOCK).unlink()
                 folder.rmdir()
-            raise
+        raise
 
 
-def _claim(folder: Path, own: Mapping[str, object], file: str, keys: Sequence[str], what: str) -> None:
+def _refuse(folder: Path, own: Mapping[str, object], file: str, keys: Sequence[str], what: str) -> bool:
+    """Raises OutputError where a folder is not this run's; whether it has been before."""
     not_a_file(folder)
-    record, content = folder / file, to_json(own, indent=2)
+    record = folder / file
     if record.is_file():
         present = read_json(record, f"the record of a {what}", "choose another --out", OutputError)
-        mine = json.loads(content)
+        mine = json.loads(to_json(own))
         differing = ", ".join(key.removesuffix("_sha256") for key in keys if present.get(key) != mine[key])
         if differing:
             other = f"another {what} (it differs in {differing})"
             raise OutputError(f"--out {folder}: holds {other}; choose another folder or delete it")
-        return
+        return True
     if folder.is_dir() and any(p for p in folder.iterdir() if not p.name.startswith(".")):
         raise OutputError(f"--out {folder}: holds files of something else; choose an empty or a new folder")
-    write_text(record, content)
+    return False
 
 
 def write_all(calibration: Calibration, problem: Problem, folder: Path) -> Calibration:

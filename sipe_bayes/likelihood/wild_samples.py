@@ -103,12 +103,12 @@ def wild_residuals(windows: Windows, residual: FloatArray) -> IntArray:
         sudden = at[moved[at] > WILD.position_times * _around(moved)[at]]
         for number in np.unique(log[at]):
             first, past = np.searchsorted(log, [number, number + 1])
-            own, rows = at[(at >= first) & (at < past)] - first, series[first:past, None]
+            rows, longest = series[first:past, None], max(int(WILD.longest_share * (past - first)), WILD.longest)
             edges = np.flatnonzero(np.diff(sequence.window[first:past]))  # there a start of its own moves a residual
-            own = own if windows.num_start else np.setdiff1d(own, edges)  # to nought, from a known one
-            wild[first:past] = _away(rows, own, WILD.longest, edges)
-            own, longest = sudden[(sudden >= first) & (sudden < past)] - first, int(WILD.longest_share * len(rows))
-            wild[first:past] |= _away(rows, own, max(longest, WILD.longest))
+            own, seen = (one[(one >= first) & (one < past)] - first for one in (at, sudden))
+            if not windows.num_start:  # to nought, where the start is known
+                own, seen = np.setdiff1d(own, edges), np.setdiff1d(seen, edges)
+            wild[first:past] = _away(rows, own, WILD.longest, edges) | _away(rows, seen, longest)
         if wild.any() and wild.sum() <= WILD.most * len(index):
             sample = windows.start[sequence.window] + index % length
             found.append(np.stack([log[wild], sample[wild], np.full(wild.sum(), windows.channels[c])], axis=1))

@@ -26,7 +26,8 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 
 SD = 0.1  # rad or m, and ten times as much a second: how far from closed a window may start, a noisy crank included
 _STEP, _MOST, _TOLERANCE, _APART, _HARDLY = 0.05, 30, 1e-10, 1e-6, 1e-3
-_NEARER, _IN_VAIN = 0.9, 4  # of what a loop is open: steps that bring no less until it is given up
+_LONGEST = 0.3  # rad or m, a step
+_KEPT, _IN_VAIN = 0.1, 4  # of what a step promises; and how many in a row that keep less until a loop is given up
 _FOLDED = 0.02  # of the largest singular value, now or by the next sample as it goes
 _APPROACH = 40  # steps from the reset to the first sample, at least
 
@@ -72,16 +73,16 @@ class _Chain:
 
     def closed(self, position: FloatArray) -> FloatArray:
         """Positions (nq,) at which joints that nothing measures are moved so that the chain closes."""
-        out, way, least, vain = position.copy(), np.zeros(self.model.nv), np.inf, 0
+        out, way, wanted, vain = position.copy(), np.zeros(self.model.nv), np.inf, 0
         for _ in range(_MOST if len(self.dofs) else 0):
             residual, jacobian = self.at(out)
             size = float(np.abs(residual).max(initial=0.0))
-            vain = 0 if size < _NEARER * least else vain + 1
-            least = min(least, size)
-            if vain == _IN_VAIN and size > _TOLERANCE:  # it can not be closed
+            vain = vain + 1 if size > wanted and size > _TOLERANCE else 0
+            if vain == _IN_VAIN:  # it can not be closed
                 break
             step = -np.linalg.lstsq(jacobian[:, self.dofs], residual, rcond=_APART)[0]
-            way[self.dofs] = np.clip(step, -0.3, 0.3)
+            wanted = size * (1 - _KEPT * min(1.0, _LONGEST / max(float(np.abs(step).max(initial=0.0)), 1e-300)))
+            way[self.dofs] = np.clip(step, -_LONGEST, _LONGEST)
             mujoco.mj_integratePos(self.model, out, way, 1.0)
             if np.abs(step).max() < _TOLERANCE:
                 break
@@ -144,7 +145,9 @@ def dependent_joints(model: mujoco.MjModel, known: Collection[int], reset: Float
     return _Chain(model, known, model.qpos0 if reset is None else reset).joints
 
 
-def close(model: mujoco.MjModel, states: FloatArray, reset: FloatArray, known: Collection[int]) -> list[int]:
+def close(
+    model: mujoco.MjModel, states: FloatArray, reset: FloatArray, known: Collection[int], along: bool = True
+) -> list[int]:
     """Write positions and velocities of what nothing measures into states (T+1, S) along a log.
 
     Args:
@@ -152,6 +155,7 @@ def close(model: mujoco.MjModel, states: FloatArray, reset: FloatArray, known: C
         states: of which the known joints are right.
         reset: a state (S,) in which the chain is assembled.
         known: ids of the joints that are measured, or of which the model says where they start.
+        along: whether the states are one sample after the other, so that two tell where it goes.
 
     Returns:
         Ids of the joints that follow the known ones all along.
@@ -183,7 +187,7 @@ def close(model: mujoco.MjModel, states: FloatArray, reset: FloatArray, known: C
     for state in states:
         *_, position = gone(state[1 : 1 + nq], 1)
         opening, loose = chain.opening(position)
-        follows -= loose if min(opening, 2 * opening - last) < _FOLDED else set()
+        follows -= loose if min(opening, 2 * opening - last if along else opening) < _FOLDED else set()
         last = opening
         state[1 : 1 + nq] = position
         jacobian = chain.at(position)[1]

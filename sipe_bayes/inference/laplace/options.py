@@ -98,12 +98,14 @@ class ContactTuning(Options):
         60, "searches from far around the best place, while more than the starts' noise is left", least=0
     )
     far: float = option(8.0, "how far: beyond several jumps", "sds", above=0)
-    told: float = option(0.2, "sd below which single control steps tell a parameter", "of the cube", above=0)
+    determined: float = option(0.2, "sd below which single control steps tell a parameter", "of the cube", above=0)
     nearby: int = option(6, "further searches on longer beginnings, from around a place that fits", least=0)
     away: float = option(3.0, "how far around: beyond the next jump", "sds", above=0)
-    nearby_share: float = option(0.3, "of the budget: then there are none", above=0)
+    nearby_share: float = option(0.3, "of the budget: then there are none around one that fits to the end", above=0)
     fitting_share: float = option(0.15, "of the budget: then no more candidates are followed once one fits", above=0)
-    first_share: float = option(0.45, "of the budget: then there are no more of these", above=0)
+    first_share: float = option(
+        0.45, "of the budget: then there are none from far around, nor around places of a way that ends", above=0
+    )
     budget_share: float = option(0.6, "of the budget in all: the rest is the search's", above=0, below=1)
     anew_share: float = option(0.2, "of the budget, that has to be left to begin anew with", above=0)
     long: int = option(256, "control steps from which a log on which nothing touches is fitted so as well", least=32)

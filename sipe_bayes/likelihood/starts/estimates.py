@@ -79,9 +79,11 @@ def _estimated(
         _put_felt(simulator, {r.quantity: r for r in readings if r.joint == joint}, trajectory, states)
     known = measured_joints(simulator, np.asarray(np.isfinite(trajectory.observations).any(0)))
     indirect = _put_indirect(simulator, trajectory, states, known, measured, raw)
-    rows = np.arange(len(states)) if rows is None else rows
-    some = states[rows]
-    follow: Followed = dict.fromkeys(close(model, some, simulator.default_state(), known | indirect), (SD, 10 * SD))
+    if rows is None or not len(rows) or may_touch(model):  # what rests is looked for along the log
+        rows = np.arange(len(states))
+    some, reset = states[rows], simulator.default_state()
+    closed = close(model, some, reset, known | indirect, along=len(rows) == len(states))
+    follow: Followed = dict.fromkeys(closed, (SD, 10 * SD))
     states[rows] = some
     unknown = set(range(model.njnt)) - known - indirect - set(follow)
     if unknown and may_touch(model) and not simulator.environment.stepwise:

@@ -184,7 +184,7 @@ def _surety(scores: FloatArray, i: int, j: int) -> float:
 
 
 def _by_position(positions: Sequence[Match], velocities: Sequence[Match], table: Table) -> list[Match]:
-    """Velocities exchanged among the joints, and given to others, where the slopes of positions tell so."""
+    """Velocities exchanged among the joints, and those without a name given to others, where slopes tell so."""
     places = {m.target.removesuffix("position"): table[m.column] for m in positions}
     targets = list(dict.fromkeys([*(m.target for m in velocities), *(f"{place}velocity" for place in places)]))
     scores = np.zeros((len(velocities), len(targets)))
@@ -192,7 +192,8 @@ def _by_position(positions: Sequence[Match], velocities: Sequence[Match], table:
         for j, target in enumerate(targets):
             place = places.get(target.removesuffix("velocity"))
             share = 0.0 if place is None else slope_of(place, table[match.column]).share
-            scores[i, j] = share + 0.2 * (i == j)
+            given = j < len(velocities) or not match.named  # what is called after a joint is no other one's
+            scores[i, j] = (share if given else -1.0) + 0.2 * (i == j)
     rows, objects = scipy.optimize.linear_sum_assignment(-scores)
     pairs = sorted(zip(objects.tolist(), rows.tolist(), strict=True))
     return [replace(velocities[i], target=targets[j]) for j, i in pairs]

@@ -119,7 +119,7 @@ def started_anew(problem: SearchProblem, windows: Windows, state: WindowState) -
     """
     best, tuning = max(state.optima, key=lambda optimum: optimum.evidence, default=None), problem.options.tuning
     left = (windows.budget - windows.rollouts) / windows.budget
-    if best is None or not best.unexplained or problem.options.initial is not None:
+    if best is None or not best.unexplained or problem.options.initial is not None or not problem.options.candidates:
         return None
     if left < tuning.contact.anew_share or len(state.points) >= tuning.windows.most_points:
         return None
@@ -164,8 +164,8 @@ class _Growth:
                 if rest is None or any(one.holds(rest) and one.misfit < rest.misfit + 1 for one in first):
                     continue
                 first[:] = _with(first, rest)
-                told = rest.fits and rest.sd.max() < self.tuning.told  # else what fits is no place
-                chains.append(self._followed(rest) if told else [rest])
+                determined = rest.sd.max() < self.tuning.determined  # else what fits is no place
+                chains.append(self._followed(rest) if rest.fits and determined else [rest])
                 fitting = _with(fitting, chains[-1][-1] if self._whole(chains[-1]) else None)
                 if fitting and self.used > self.tuning.fitting_share:
                     break
@@ -238,7 +238,8 @@ class _Growth:
         chain = self._straight([first])
         try:
             for number in range(self.tuning.nearby):
-                if self._whole(chain) and (number or self.used > self.tuning.nearby_share):
+                most = self.tuning.nearby_share if self._whole(chain) else self.tuning.first_share
+                if self.used > most or (number and self._whole(chain)):
                     break
                 chain = self._beside(chain)
         except BudgetExhausted:

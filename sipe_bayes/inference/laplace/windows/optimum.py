@@ -217,7 +217,6 @@ def judged(
     unsmooth, gain, off = ending.tells and ending.refused > most, ending.refused, optimum.mean - ending.theta
     if windows.num_start and sandwiches(windows):  # in nats of its own width
         gain = 0.5 * float(off @ np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) @ off)
-    may_be_uneven = begins_in_contact(windows) and bool(np.median(ending.noise.tau) < windows.simulator.dt)
     if ending.cut_short and not ending.settled:
         reason = finding(Code.SEARCH_CUT_SHORT)
     elif not ending.settled:
@@ -226,7 +225,7 @@ def judged(
         reason = finding(Code.NOT_SMOOTH, gain=gain)
     elif (times := beyond_start_noise(windows, optimum.sd)) is not None:
         reason = finding(Code.BEYOND_START_NOISE, times=times, which="all")
-    elif may_be_uneven and (times := unevenly_left(windows, ending.residual)) is not None:
+    elif begins_in_contact(windows) and (times := unevenly_left(windows, ending.residual)) is not None:
         reason = finding(Code.BEYOND_START_NOISE, times=times, which="some")
     if around is not None:
         covariance = around.covariance

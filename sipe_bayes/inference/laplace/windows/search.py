@@ -24,9 +24,9 @@ large the noise is and what fits as well, and a finding says so.
 
 Where the budget ends before the first optimum, the best point so far is recorded in its place; where theta alone is
 searched, what is kept of the budget is spent on such a look around it. Of that point, and, where theta alone is
-searched, of an optimum where no step found the gain that its linearisation foretold and of one that is a stroke of
-luck, the normal says nothing; its sd is guessed: the way from the starting point (root mean square over theta), times
-the share of the first misfit that is left, as a misfit that is theta's shrinks with the distance.
+searched, of an optimum where no step found the gain that its linearisation foretold, of a stroke of luck and of one
+that leaves more than the noise of known starts, the normal says nothing; its sd is guessed: the way from the starting
+point (root mean square over theta), times the share of the first misfit that is left, as one that is theta's shrinks.
 """
 
 from __future__ import annotations

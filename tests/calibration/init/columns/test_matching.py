@@ -148,6 +148,9 @@ def test_one_rate_of_a_gyro_is_the_joints_whose_slope_it_is() -> None:
     (velocity,) = match_columns(machine, table).velocities
     assert velocity.target == "joint:pitch.velocity"
     assert velocity.label.unit == "deg/s"
+    table |= {"wheel_vel_rad_s": 5 * np.cos(2 * time + 1)}
+    named = match_columns(machine, {k: v for k, v in table.items() if not k.startswith("gyro")}).velocities
+    assert [m.target for m in named] == ["joint:wheel.velocity"]  # whatever else it is like
     (alone,) = match_columns(machine, {"gyro_y_dps": table["gyro_y_dps"]}).velocities
     assert alone.target == "joint:wheel.velocity"
 
