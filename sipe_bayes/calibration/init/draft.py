@@ -197,6 +197,7 @@ class Draft:
         unknowns: parameters, those that are left out among them.
         doubts: what could not be decided, beside what readings say.
         notes: of the whole.
+        unused: columns that are none of the model's.
         delay: of the commands, in samples.
     """
 
@@ -211,6 +212,7 @@ class Draft:
     unknowns: tuple[Unknown, ...] = ()
     doubts: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
     delay: float = 0.0
 
     @property

@@ -97,7 +97,8 @@ def propose(
     draft = Draft(
         _relative(model_path, folder), opened.clock, opened.episodes, commands, measurements, lines, 1e-3,
         doubts=(*dropped, *matches.doubts, *loads([opened, *others]), *_unmatched(model, machine, matches, commands)),
-        notes=(*_unused(matches, commands), *nameless(model, {model.body(body).id for body in machine.bodies})),
+        notes=tuple(nameless(model, {model.body(body).id for body in machine.bodies})),
+        unused=_unused(matches, commands),
     )  # fmt: skip
     positions = bool(tried_part(draft).measurements)
     trained = (
@@ -220,9 +221,7 @@ def _poses(model: mujoco.MjModel, joint: int) -> list[str]:
 
 def _unused(matches: Matches, commands: Sequence[Reading]) -> tuple[str, ...]:
     supplies = {reading.supply[0] for reading in commands if reading.supply}
-    left = [column for column in matches.left if column not in supplies]
-    others = f" and {len(left) - 12} others" if len(left) > 12 else ""
-    return (f"not used: {', '.join(left[:12])}{others}",) if left else ()
+    return tuple(column for column in matches.left if column not in supplies)
 
 
 def _split(

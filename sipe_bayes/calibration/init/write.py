@@ -15,7 +15,8 @@ _INLINE = 6  # logs from which they stand on one line each
 
 def toml_of(draft: Draft, command: str) -> str:
     """The whole file; command: what wrote it."""
-    parts = [_comment(f"Written by: {command}"), *(_comment(note) for note in draft.notes), *map(_open, draft.doubts)]
+    notes = [f"Written by: {command}", *_unused(draft), *draft.notes]
+    parts = [*map(_comment, notes), *map(_open, draft.doubts)]
     text = "\n".join(parts) + "\n\n" + to_toml({"model": draft.model, **draft.likelihood}).rstrip("\n")
     text += f" # {printed(draft.window_note)}\n"
     if len(draft.logs) >= _INLINE:
@@ -78,6 +79,7 @@ def summary(draft: Draft, path: str) -> list[str]:
     held, train = (
         sum(max(1, len(log.episodes)) for log in draft.logs if log.use == use) for use in ("holdout", "train")
     )
+    lines += map(_short, _unused(draft))
     lines.append(f"time {draft.clock.column!r} in {draft.clock.unit}; {train} to train on, {held} held out")
     names = [unknown.name for unknown in draft.proposed]
     lines.append(_short(f"{len(names)} unknowns: {', '.join(names)}"))
@@ -90,6 +92,11 @@ def summary(draft: Draft, path: str) -> list[str]:
             f"and {len(open_lines) - room + 1} more that are open, see OPEN in {path}",
         ]
     return [*lines, *map(_short, open_lines), f"{path} is written; look it through, then: sipe calibrate {path}"]
+
+
+def _unused(draft: Draft) -> list[str]:
+    left = draft.unused
+    return [f"not used: {', '.join(left[:12])}{f' and {len(left) - 12} others' * (len(left) > 12)}"] if left else []
 
 
 def _said(reading: Reading) -> str:

@@ -11,6 +11,7 @@ import pytest
 
 from sipe_bayes.calibration.init.draft import Draft
 from sipe_bayes.calibration.init.propose import propose
+from sipe_bayes.calibration.init.write import summary
 
 ARM = """<mujoco><option timestep="0.004" integrator="implicitfast"/><worldbody>
   <body name="upper"><joint name="shoulder" axis="0 1 0" damping="{damping}"/>
@@ -65,9 +66,9 @@ def test_efforts_are_measured_with_their_sign_and_unit_and_make_forces_known(tmp
 )
 def test_what_is_no_effort_is_named_and_left(tmp_path: Path, scales: dict[str, float], name: str, words: str) -> None:
     draft = proposed(tmp_path, scales, name)
-    print(draft.notes)
+    print(draft.notes, draft.unused)
     assert not any(r.match.target.endswith(".force") for r in draft.measurements)
-    assert any(words in note for note in draft.notes)
+    assert any(words in line for line in (*draft.notes, *summary(draft, "calibrate.toml")))
     assert any("no force is known" in doubt for doubt in draft.doubts)
 
 
