@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 import sipe_bayes as sipe
 from sipe_bayes.cli.app import app
+from sipe_bayes.core.files import LOCK
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
 from sipe_bayes.posterior import load_posterior
 from sipe_bayes.rl.randomization import Randomization, load_randomization
@@ -96,6 +97,7 @@ def test_output_folder(finished: tuple[Path, Path, Any]) -> None:
         *("checkpoint.safetensors", "checks", "posterior.safetensors", "posterior.json", "posterior.nc", "run.json"),
         *("identified.xml", "domain_randomization.json", "randomization", "result.json", "report.html", "figures"),
         *(f"domain_randomization_posterior.{kind}" for kind in ("safetensors", "json")),
+        LOCK,
     }
     assert list((out / "figures").iterdir())
     assert strict_json((out / "result.json").read_text()) == strict_json(result.stdout)
