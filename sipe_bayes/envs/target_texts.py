@@ -84,7 +84,7 @@ TARGET_TEXTS: dict[str, dict[str, str]] = {
         "bias_position": "force for each unit of position",
         "bias_velocity": "force for each unit of velocity, as back-EMF",
         "offset": "added to the command, in its unit; not a physical property",
-        "delay": "s; the command arrives later, interpolated between physics steps; below half a step there is none",
+        "delay": "s; the command arrives later, interpolated between physics steps",
         "force_limit": "largest force either way",
         "command_limit": "largest command either way",
         "lag": 's; time constant of an actuator with `dyntype="filterexact"` or `"filter"`, or of a dcmotor\'s current',

@@ -190,13 +190,12 @@ def _actuator_offset(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
 def _actuator_delay(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
     """MuJoCo reads a delayed command before it stores the present one.
 
-    So it knows no delay between none and one physics step, beyond which it is interpolated between steps: one below
-    half a step acts as none, one above as a whole step, or none would be a single point that no interval holds. A
-    difference over less than two steps sees either nothing or the whole first one.
+    Any delay above zero up to one physics step acts as one physics step, and zero as none; beyond one step it is
+    interpolated between steps. A difference over less than two steps sees either nothing or the whole first one.
     """
 
     def write(other: mujoco.MjModel, value: float) -> None:
-        other.actuator_delay[actuator] = 0.0 if value < 0.5 * other.opt.timestep else value
+        other.actuator_delay[actuator] = value
 
     present, step = float(model.actuator_delay[actuator]), 2 * float(model.opt.timestep)
     return Target(spec, "s", present, write, minimum=0.0, physical=False, step=step)

@@ -199,16 +199,6 @@ def test_differences_of_a_delay_are_two_physics_steps() -> None:
     assert plain.least_steps(np.zeros(1))[0] == 0.25
 
 
-def test_a_delay_below_half_a_physics_step_is_none() -> None:
-    """Of .002 s; beyond that the command comes a whole step later."""
-    environment = build(p("delay", 0, 0.05, "actuator:motor.delay"))
-    model = environment.compile()
-    assert model.opt.timestep == 0.002
-    for value, written in ((0.0, 0.0), (0.0009, 0.0), (0.0011, 0.0011), (0.003, 0.003)):
-        environment.write(model, np.array([value]))
-        assert model.actuator_delay[model.actuator("motor").id] == written
-
-
 def test_history_leaves_models_without_delay_alone() -> None:
     environment = build()
     state = np.zeros((1, 3))
