@@ -92,7 +92,7 @@ def claimed(
         OutputError: when it holds another run, or one is at work in it.
     """
     mine = False
-    _refuse(folder, own, file, keys, what)
+    _refuse(folder, own, file, keys, what)  # before another one's folder is given a lock
     try:
         with exclusive(folder):
             if not _refuse(folder, own, file, keys, what):

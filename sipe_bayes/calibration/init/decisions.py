@@ -93,9 +93,10 @@ def _by_names(draft: Draft, asked: Sequence[Question]) -> Draft:
     text = "no simulation follows these logs better than a straight line does, so units and signs stand on names alone"
     doubts = [*draft.doubts, f"{text}; look at the model and at what drives it"]
     readings = answered(draft.readings, asked, named_answers(asked))
-    for number in dict.fromkeys(1 / r.factor for r in readings if r.scales and r.factor != 1):
-        names = ", ".join(repr(r.match.column) for r in readings if r.scales and r.factor == 1 / number)
-        doubts.append(f"{names}: {number:g} counts a turn is a guess; write what the encoder has")
+    counting = [reading for reading in readings if reading.scales and reading.factor != 1]
+    for factor in dict.fromkeys(reading.factor for reading in counting):
+        names = ", ".join(repr(reading.match.column) for reading in counting if reading.factor == factor)
+        doubts.append(f"{names}: {1 / factor:g} counts a turn is a guess; write what the encoder has")
     return _read_as(draft, readings, doubts)
 
 

@@ -16,9 +16,9 @@ PUSHED = {"ax", "ay", "az"}  # accelerations of a body
 OF_BODIES = ALONG | ABOUT | PUSHED
 """Words with an axis, of velocities and accelerations."""
 GYROS = {"gyro", "gyros", "gyroscope", "omega"}
-SPEEDS = {"velocity", "velocities", "vel", "speed", "omega", "w", "qvel", "rate", "gyro", "v", "xv", "av"} | {
+SPEEDS = {"velocity", "velocities", "vel", "speed", "w", "qvel", "rate", "v", "xv", "av"} | {
     "angvel", "drehzahl", "drehz", "geschwindigkeit",
-} | ALONG | ABOUT  # fmt: skip
+} | GYROS | ALONG | ABOUT  # fmt: skip
 ACCELERATIONS = PUSHED | {"acceleration", "accelerations", "acc", "accel", "qacc", "ddq", "qdd", "ddot"} | {
     "accelerometer",
 }  # fmt: skip
