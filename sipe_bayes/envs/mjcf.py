@@ -243,11 +243,11 @@ class MjcfEnvironment(Environment):
         return start_sd(model, felt_sd(model, self.poses, super().start_sd(model)))
 
     def least_steps(self, theta: FloatArray) -> FloatArray:
-        """Two physics steps of a delay, as far as they lie in the cube."""
+        """What the targets say, as far as it lies in the cube."""
         steps = np.zeros(len(self.parameters))
         for j, multiplier, target in self._targets:
             value = multiplier * float(self.parameters[j].value(theta[j]))
-            if value < target.step:
+            if target.step and value < target.below:
                 ahead = float(self.parameters[j].normalise((value + target.step) / multiplier))
                 steps[j] = max(steps[j], min(ahead - theta[j], _LONGEST_STEP))
         return steps

@@ -47,7 +47,8 @@ class Target:
         constants: MuJoCo's derived constants, counts or flags depend on it, so mj_setConst follows a write.
         minimum: the smallest physical value.
         physical: whether it is a property of the machine that a report may compare with the model's.
-        step: the least change that a finite difference can be taken over, from values below it.
+        step: the least change that a finite difference can be taken over.
+        below: from values below this one; beyond it any change will do.
         shape: whether its value in the model says nothing, as that of a force's shape while its size is zero.
     """
 
@@ -60,6 +61,7 @@ class Target:
     minimum: float = -np.inf
     physical: bool = True
     step: float = 0.0
+    below: float = np.inf
     shape: bool = False
 
 

@@ -188,16 +188,16 @@ def _actuator_offset(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
 
 
 def _actuator_delay(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
-    """MuJoCo reads a delayed command before it stores the present one.
+    """The command is interpolated between physics steps, below one by ``simulation.short_delays``.
 
-    Any delay above zero up to one physics step acts as one physics step, and zero as none; beyond one step it is
-    interpolated between steps. A difference over less than two steps sees either nothing or the whole first one.
+    A jump of the command so turns into two, which an actuator at its limit can not tell from one: the effect rises in
+    stairs, each as long as a physics step, over which a difference has the mean slope.
     """
 
     def write(other: mujoco.MjModel, value: float) -> None:
         other.actuator_delay[actuator] = value
 
-    present, step = float(model.actuator_delay[actuator]), 2 * float(model.opt.timestep)
+    present, step = float(model.actuator_delay[actuator]), float(model.opt.timestep)
     return Target(spec, "s", present, write, minimum=0.0, physical=False, step=step)
 
 
@@ -283,7 +283,7 @@ def _lag(model: mujoco.MjModel, spec: str, actuator: int) -> Target:
         raise TargetError(f'target {spec!r}: needs an actuator with dyntype="filterexact", or a dcmotor\'s inductance')
     least = step if kind == int(dyn.mjDYN_FILTER) else 0.0  # by Euler's steps shorter ones overshoot
     target = entry("actuator_dynprm", "s", 0, minimum=least)(model, spec, actuator)
-    return replace(target, step=2 * step)  # shorter ones than a physics step act alike
+    return replace(target, step=2 * step, below=2 * step)  # shorter ones than a physics step act alike
 
 
 def _numeric(number: Number, label: str, slot: int) -> Maker:

@@ -338,15 +338,14 @@ class Windows:
             with_theta: whether the Jacobian holds the columns of theta.
             with_starts: whether it holds those of the starts.
             residual: (W, L, C), of a valid simulation at this very point, which spares the one.
-            theta_step: of the differences, of the cube; default ``self.theta_step``, or ``least_steps`` if longer.
+            theta_step: of the differences, of the cube; default ``self.theta_step``; ``least_steps`` where longer.
             start_step: the same of the starts, a number or (D,).
 
         Raises:
             BudgetExhausted: instead of simulating beyond the budget.
         """
         n, d = (self.num_theta if with_theta else 0), (self.num_start if with_starts else 0)
-        default = np.maximum(self.theta_step, self.least_steps(theta))
-        size = default if theta_step is None else np.broadcast_to(theta_step, theta.shape)
+        size = np.maximum(self.theta_step if theta_step is None else theta_step, self.least_steps(theta))
         of_starts = np.broadcast_to(start_step, self.num_start)[:d]
         sign = np.where(theta + size <= 1, 1.0, -1.0)
         thetas, all_starts = np.tile(theta, (n + d + 1, 1)), np.tile(starts, (n + d + 1, 1, 1))

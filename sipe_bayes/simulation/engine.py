@@ -20,6 +20,7 @@ from sipe_bayes.envs.foreign.quiet import quiet
 from sipe_bayes.simulation.firmware_steps import FirmwareSteps
 from sipe_bayes.simulation.law_steps import LawSteps
 from sipe_bayes.simulation.mjdata import Fields
+from sipe_bayes.simulation.short_delays import ShortDelays
 
 _TIME_TOLERANCE = 0.5  # of a physics step: a reset or a repeated sample is a whole one off
 _FORCES = int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
@@ -75,6 +76,7 @@ class Engine:
         self._datas = [mujoco.MjData(model) for _ in range(num_threads)]
         self.laws = LawSteps(model, environment.control_spec)
         self.firmware = FirmwareSteps(model)
+        self.short_delays = ShortDelays(model)
         self._fields = Fields(environment.data_fields, self._datas) if environment.data_fields else None
 
     @property
@@ -184,7 +186,20 @@ class Engine:
     ) -> tuple[FloatArray, FloatArray]:
         """As ``_native``, without firmware."""
         if self.laws:
-            return self.laws.advance(self._steps, models, start, controls, reads_sensors)
+            return self.laws.advance(self._punctual, models, start, controls, reads_sensors)
+        return self._punctual(models, start, controls, control_spec, reads_sensors)
+
+    def _punctual(
+        self,
+        models: Sequence[mujoco.MjModel],
+        start: FloatArray,
+        controls: FloatArray,
+        control_spec: int,
+        reads_sensors: bool,
+    ) -> tuple[FloatArray, FloatArray]:
+        """As ``_native``, without laws."""
+        if self.short_delays:
+            return self.short_delays.advance(self._steps, models, start, controls, control_spec, reads_sensors)
         return self._steps(models, start, controls, control_spec, reads_sensors)
 
     def _steps(
@@ -195,7 +210,7 @@ class Engine:
         control_spec: int,
         reads_sensors: bool,
     ) -> tuple[FloatArray, FloatArray]:
-        """As ``_native``, by ``mujoco.rollout`` alone, without laws."""
+        """As ``_native``, by ``mujoco.rollout`` alone, with delays as it knows them."""
         batch, steps = controls.shape[:2]
         out = np.empty((batch, steps, self.physics_size))
         sensors = np.empty((batch, steps, self.model.nsensordata)) if reads_sensors else None

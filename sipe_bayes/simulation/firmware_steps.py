@@ -20,6 +20,7 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.envs.laws.firmware import BoundFirmware, firmware_of
 from sipe_bayes.simulation.law_steps import Steps
+from sipe_bayes.simulation.short_delays import stored
 
 _EARLY = 1e-6  # of a period: a tick is not late by rounding
 _ENDLESS = 1e10
@@ -261,14 +262,10 @@ class FirmwareSteps:
         bound = loop.bound
         first = bound.activations.start
         out[:, :, first : first + loop.kept.shape[1]] = loop.kept[:, None]
-        samples = (bound.history.stop - bound.history.start) // 2
-        if samples:
+        if samples := (bound.history.stop - bound.history.start) // 2:
             begin = bound.history.start
-            stamped, value = out[:, :, begin : begin + samples], out[:, :, begin + samples : bound.history.stop]
-            begun, last = times[:, :1, None], times.shape[1] - 1
-            step = (stamped - begun) / timestep[:, None, None]
-            new = np.take_along_axis(set_points[:, None], np.clip(np.rint(step), 0, last).astype(int), axis=2)
-            value[:] = np.where((step > -0.5) & (step < last + 0.5), new, value)
+            stamped, values = slice(begin, begin + samples), slice(begin + samples, bound.history.stop)
+            stored(out, stamped, values, times, set_points, timestep)
 
 
 def _due(times: FloatArray, period: float) -> BoolArray:

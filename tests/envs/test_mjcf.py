@@ -182,8 +182,8 @@ def test_history_has_room_for_the_longest_delay() -> None:
         environment.history(model, state, past, np.array([0.0005]))
 
 
-def test_differences_of_a_delay_are_two_physics_steps() -> None:
-    """Of .002 s each, from delays below two; on a log scale as well, and never more than a quarter of the range."""
+def test_differences_of_a_delay_are_one_physics_step() -> None:
+    """Of .002 s, whatever the delay; on a log scale as well, and never more than a quarter of the range."""
     environment = build(
         p("delay", 0, 0.05, "actuator:motor.delay"),
         p("log", 0.001, 0.1, "actuator:servo.delay", scale="log"),
@@ -191,12 +191,20 @@ def test_differences_of_a_delay_are_two_physics_steps() -> None:
         measurements=("joint:hinge.position",),
         source=XML.replace(' nsample="3" delay=".004"', "").replace('kp="10"', 'kp="10" delay=".02" nsample="60"'),
     )
-    low = environment.space.normalise(np.array([0.003, 0.0039, 1.0]))
-    np.testing.assert_allclose(environment.least_steps(low), [0.08, np.log(7.9 / 3.9) / np.log(100), 0.0])
-    high = environment.space.normalise(np.array([0.0041, 0.0041, 1.0]))
-    np.testing.assert_array_equal(environment.least_steps(high), 0.0)
-    plain = build(p("delay", 0, 0.01, "actuator:motor.delay"), source=XML.replace(' nsample="3" delay=".004"', ""))
+    for motor, servo in ((0.003, 0.0039), (0.0041, 0.05)):
+        here = environment.space.normalise(np.array([motor, servo, 1.0]))
+        steps = [0.04, np.log((servo + 0.002) / servo) / np.log(100), 0.0]
+        np.testing.assert_allclose(environment.least_steps(here), steps)
+    plain = build(p("delay", 0, 0.005, "actuator:motor.delay"), source=XML.replace(' nsample="3" delay=".004"', ""))
     assert plain.least_steps(np.zeros(1))[0] == 0.25
+
+
+def test_differences_of_a_short_lag_are_two_physics_steps() -> None:
+    """Of .002 s each, from lags below two; beyond, any difference will do."""
+    source = XML.replace('kp="10"', 'kp="10" timeconst="0.02"')
+    environment = build(p("lag", 0, 0.05, "actuator:servo.lag"), source=source, measurements=("joint:hinge.position",))
+    for lag, step in ((0.0, 0.08), (0.0039, 0.08), (0.0041, 0.0)):
+        np.testing.assert_allclose(environment.least_steps(environment.space.normalise(np.array([lag]))), [step])
 
 
 def test_history_leaves_models_without_delay_alone() -> None:

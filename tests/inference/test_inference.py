@@ -168,17 +168,18 @@ def test_wrong_input() -> None:
     "likelihood", [sipe.Segments(0.5, noise="white"), sipe.StateSpace()], ids=["segments", "states"]
 )
 def test_a_delay_of_none_is_found(likelihood: Any) -> None:
-    """The model as given has none either, and any delay up to one physics step acts as one.
+    """The model as given has none either.
 
-    A slope taken there says nothing. Intervals of 99 %: of the four, right ones fail with probability 4 %, and the seed
-    is fixed.
+    Intervals of 99 %: of the eight, right ones fail with probability 8 %, and the seeds are fixed.
     """
     delay = Parameter("delay", 0.0, 0.05, targets=("actuator:motor.delay",))
     simulator = pendulum(delay)
-    posterior = get_estimator(simulator, "laplace", likelihood=likelihood).fit(
-        log(simulator, [0.6, 0.1, 0.0], 2, steps=200)
-    )
-    low, middle, high = simulator.space.values(posterior.quantile([0.005, 0.5, 0.995]).numpy())
-    assert middle[2] < 0.005
-    assert low[0] < 0.6 < high[0]
-    assert low[1] < 0.1 < high[1]
+    for seed in (2, 4, 5, 7):
+        posterior = get_estimator(simulator, "laplace", likelihood=likelihood).fit(
+            log(simulator, [0.6, 0.1, 0.0], seed, steps=200)
+        )
+        low, middle, high = simulator.space.values(posterior.quantile([0.005, 0.5, 0.995]).numpy())
+        assert middle[2] < 0.005
+        assert low[2] < 0.0005
+        assert low[0] < 0.6 < high[0]
+        assert low[1] < 0.1 < high[1]

@@ -35,9 +35,6 @@ class WindowTuning(Options):
     subset_gain_unforetold: float = option(0.1, "the same for a gain that was not foretold", "of the energy")
     foretold: float = option(0.2, "how well a kept Jacobian has to foretell a gain", "relative", above=0)
     most_drift: float = option(0.5, "how far what was foretold since it was taken may be wrong", "nats", above=0)
-    most_drift_of_delays: float = option(
-        100.0, "gain that is refused where a delay is unknown, likewise", "nats", above=0
-    )
     open_sd: float = option(0.5, "sd from which a direction counts as open", "of the cube", above=0)
     off_centre: float = option(0.1, "distance from a ridge's middle that is worth going", "of the cube", above=0)
     as_good: float = option(2.0, "how much worse a ridge's middle may be", "nats", above=0)

@@ -84,7 +84,7 @@ def rest_on(
     """
     view, share = beginning(windows, horizon, limit)
     tuning, rule, starts = problem.options.tuning.contact, problem.options.tuning.damping, view.no_starts()
-    least = np.maximum(max(view.theta_step, tuning.narrowest), view.least_steps(theta))
+    least = max(view.theta_step, tuning.narrowest)
     size = np.maximum(widths, least)
     damping, residual = rule.first, np.zeros(0)
     try:

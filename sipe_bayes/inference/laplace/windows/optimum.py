@@ -54,8 +54,8 @@ class Ending:
         steps: from there.
         first_misfit: of the residuals at the starting point, in units of the channels' spread.
         refused: nats that the last steps were to gain, none of which gained anything.
-        tells: whether that is a finding: not where differences are long, or the surroundings are looked at. The normal
-            stays where the search ended, and reaches as far as was promised, either way.
+        tells: whether that is a finding: not where the surroundings are looked at. The normal stays where the search
+            ended, and reaches as far as was promised, either way.
         settled: whether nothing moved any more.
         cut_short: whether the budget ends.
         bettered: the optimum before, from which a pattern search led here; this one is to be no narrower.
@@ -80,12 +80,9 @@ class Ending:
 def is_broken(problem: SearchProblem, windows: Windows, theta: FloatArray, refused: float) -> bool:
     """Whether a linearisation at theta (N,) promises what no simulation keeps.
 
-    Steps of theta and the starts that were to gain more than rounding, ``refused`` nats, have gained nothing. Where a
-    delay is unknown they have to be many more: over less than a physics step none acts, but its secant may be right.
+    Steps of theta and the starts that were to gain more than rounding, ``refused`` nats, have gained nothing.
     """
-    tuning = problem.options.tuning.windows
-    most = tuning.most_drift_of_delays if windows.least_steps(theta).any() else tuning.most_drift
-    return windows.num_start > 0 and refused > most
+    return windows.num_start > 0 and refused > problem.options.tuning.windows.most_drift
 
 
 def summarised(problem: SearchProblem, windows: Windows, ending: Ending) -> WindowOptimum:
@@ -122,11 +119,11 @@ def summarised(problem: SearchProblem, windows: Windows, ending: Ending) -> Wind
 def widened(problem: SearchProblem, windows: Windows, ending: Ending) -> WindowOptimum:
     """The same, by differences as long as the normal is wide where that makes it wider; see ``wide_differences``.
 
-    Not asked where the starts are known, where an end is none, where differences are long already or windows grow.
+    Not asked where the starts are known, where an end is none, or windows grow.
     """
     optimum, tuning = summarised(problem, windows, ending), problem.options.tuning.wide
     ends = ending.settled and ending.refused <= problem.options.tuning.windows.most_drift
-    if not ends or not windows.num_start or grows(windows) or windows.least_steps(ending.theta).any():
+    if not ends or not windows.num_start or grows(windows):
         return optimum
     missing = 0.0
     for _ in range(tuning.rounds):

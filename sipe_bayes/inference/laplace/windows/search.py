@@ -198,7 +198,7 @@ class WindowSearch:
         windows, here, tuning = self.windows, state.here, self._tuning.windows
         view = windows.every_other()
         before, starts, kept = view.rollouts, view.no_starts(), here.kept.residual
-        lin = view.linearise(here.theta, starts, with_starts=False, residual=kept, theta_step=view.theta_step)
+        lin = view.linearise(here.theta, starts, with_starts=False, residual=kept)
         fixed = np.zeros((*lin.residual.shape, windows.num_start))
         lin = replace(lin, jacobian=np.concatenate([lin.jacobian, fixed], axis=-1))
         energy = WindowEnergy(view, present_noise(view, lin.residual), self.problem.quadratic_prior)
@@ -270,13 +270,13 @@ class WindowSearch:
     def _linearise(self, here: Position) -> tuple[Linearisation, bool, float]:
         """Linearisation at the point, whether part of it is of an earlier one, and the drift of that part."""
         windows, kept, n = self.windows, here.kept, self.windows.num_theta
-        size = np.maximum(here.theta_step, windows.least_steps(here.theta) if here.long else 0.0)
         if kept.jacobian is None or not np.isfinite(kept.drift) or not kept.keep_starts:
-            lin = windows.linearise(here.theta, here.starts, residual=kept.residual, theta_step=size)
+            lin = windows.linearise(here.theta, here.starts, residual=kept.residual, theta_step=here.theta_step)
             return lin, False, 0.0
         if not kept.moved and kept.residual is not None:
             return Linearisation(kept.residual, kept.jacobian, True), kept.drift > 0, kept.drift
-        lin = windows.linearise(here.theta, here.starts, with_starts=False, residual=kept.residual, theta_step=size)
+        size, residual = here.theta_step, kept.residual
+        lin = windows.linearise(here.theta, here.starts, with_starts=False, residual=residual, theta_step=size)
         both = np.concatenate([lin.jacobian, kept.jacobian[..., n:]], axis=-1)
         return replace(lin, jacobian=both), True, kept.drift
 
@@ -351,7 +351,7 @@ class WindowSearch:
             steps=here.iteration,
             first_misfit=here.misfit,
             refused=step.fit.refused,
-            tells=step.fit.exhausted or bool(windows.num_start and not windows.least_steps(theta).any()),
+            tells=step.fit.exhausted or windows.num_start > 0,
             settled=settled,
             cut_short=cut_short,
             bettered=state.optima[-1] if here.patterns else None,
@@ -366,8 +366,6 @@ class WindowSearch:
         # one that is searched on from is none
         optima = (*state.optima[: len(state.optima) - here.revisits], optimum)
         state = replace(state, optima=optima)
-        if windows.least_steps(theta).any() and not here.long:
-            return replace(state, here=replace(afresh, long=True, iteration=0))
         if around is not None and around.other is not None and len(state.points) < tuning.windows.most_points:
             state = replace(state, points=np.concatenate([state.points, around.other[None]]))
         if around is None or around.better is None or here.patterns >= tuning.windows.most_patterns:

@@ -66,11 +66,10 @@ class Position:
         damping: of the next step.
         iteration: steps until now; a new optimum begins again at zero.
         misfit: of the first residuals, in units of the channels' spread; zero before them.
-        theta_step: of the finite differences, at most.
+        theta_step: of the finite differences, where the environment asks for no longer ones.
         refused: nats that the last linearisation promised and no simulation kept.
         kept: what spares simulations.
         centred: whether the search has gone to the middle of a ridge.
-        long: whether differences are as long as the environment asks for.
         patterns: pattern searches that have led on.
         horizon: control steps of the beginnings of windows that are looked at; zero for whole ones.
         group: which group of windows is fitted apart; None while all are searched.
@@ -90,7 +89,6 @@ class Position:
     refused: float = 0.0
     kept: Kept = field(default_factory=Kept)
     centred: bool = False
-    long: bool = False
     patterns: int = 0
     horizon: int = 0
     group: int | None = None
@@ -118,7 +116,7 @@ class Position:
     @property
     def revisits(self) -> bool:
         """Whether the search goes on from an optimum of this very starting point."""
-        return self.patterns > 0 or self.long
+        return self.patterns > 0
 
 
 @dataclass(frozen=True)

@@ -45,11 +45,16 @@ class WideDifferences:
     ) -> WideDifferences:
         """2 N rollouts, around an optimum of residual (W, L, C) and jacobian (W, L, C, N + D) for a noise (C,).
 
-        An axis along which the cube leaves no room, or a simulation diverges, keeps the slope at the optimum.
+        An axis along which the cube leaves no room, or a simulation diverges, keeps the slope at the optimum; so does a
+        parameter whose differences are long already, at which the axes are cut.
         """
-        theta, n, tuning = optimum.theta, len(optimum.theta), problem.options.tuning.importance
-        eigenvalues, axes = np.linalg.eigh(optimum.covariance)
-        ways = tuning.probe * (axes * np.sqrt(eigenvalues)).T
+        theta, tuning, n = optimum.theta, problem.options.tuning.importance, len(optimum.theta)
+        precision = np.linalg.inv(optimum.covariance)
+        free = np.flatnonzero(windows.least_steps(theta) == 0)
+        num = len(free)
+        eigenvalues, axes = np.linalg.eigh(np.linalg.inv(precision[np.ix_(free, free)]))
+        ways = np.zeros((num, n))
+        ways[:, free] = tuning.probe * (axes * np.sqrt(eigenvalues)).T
         ways = np.concatenate([ways, -ways])
         room = np.where(ways > 0, 1 - theta, theta) / np.maximum(np.abs(ways), 1e-300)
         share = np.minimum(1.0, room.min(1))
@@ -61,18 +66,18 @@ class WideDifferences:
         # along each axis, starts following, and from there by theta alone
         local, by_starts = jacobian[..., :n], jacobian[..., n:]
         following = np.einsum("wlcd,wdn->wlcn", by_starts, optimum.slope)
-        length = share[:n] + share[n:]
-        usable = valid[:n] & valid[n:] & (length > problem.options.tuning.wide.least_room)
-        along = (local - following) @ ways[:n].T
-        along[..., usable] = np.moveaxis(change[:n] - change[n:], 0, -1)[..., usable] / length[usable]
-        wide = along @ np.linalg.inv(ways[:n].T) + following
+        length = share[:num] + share[num:]
+        usable = valid[:num] & valid[num:] & (length > problem.options.tuning.wide.least_room)
+        along = (local - following) @ ways[:num].T
+        along[..., usable] = np.moveaxis(change[:num] - change[num:], 0, -1)[..., usable] / length[usable]
+        wide = local.copy()
+        wide[..., free] = along @ np.linalg.inv(ways[:num, free].T) + following[..., free]
         # how much the points fit worse, and should
         energy, gaps = WindowEnergy(windows, noise, problem.quadratic_prior), points - optimum.mean
         falls = np.array([energy(p, s, residual - c) for p, s, c in zip(points, starts, change, strict=True)])
         falls = np.where(valid, falls - energy(theta, optimum.starts, residual), np.inf)
         middle = theta - optimum.mean
-        precision = np.linalg.inv(optimum.covariance)
         foretold = 0.5 * (np.einsum("bi,ij,bj->b", gaps, precision, gaps) - middle @ precision @ middle)
         narrow = falls + tuning.slack < tuning.least_fall * (foretold + tuning.slack)
-        missing = float(np.where(narrow, foretold - falls, 0.0).max())
+        missing = float(np.where(narrow, foretold - falls, 0.0).max(initial=0.0))
         return cls(np.concatenate([wide, by_starts], axis=-1), missing)
