@@ -80,7 +80,7 @@ class Problem:
     def tolerances(self) -> Tolerances:
         """How well forces, drawings and times are known."""
         commands = {command.actuator: command.tolerance for command in self.config.commands}
-        return Tolerances(commands, self.config.geometry_tolerance, self.config.timing_tolerance)
+        return Tolerances(commands, self.config.geometry_tolerance, self.config.timing_tolerance, 1.0)
 
     @property
     def segments(self) -> Segments:

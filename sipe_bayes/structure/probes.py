@@ -24,9 +24,10 @@ from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.extension import Extension, Placed, extended, imitating, members, placements
+from sipe_bayes.structure.extension import WORLD, Extension, Placed, extended, imitating, members, placements
 from sipe_bayes.structure.internal_starts import carried_starts, mapped_starts
 from sipe_bayes.structure.machine import machine_of
+from sipe_bayes.structure.physics_step import PHYSICS_STEP, RUNS, StepError, step_error
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
 
 _ROWS = 32  # simulated at once: all the states of a batch are in memory
@@ -89,7 +90,7 @@ def probes_cost(windows: Windows, theta: FloatArray) -> int:
         return 0
     groups = _groups(_placed(windows, theta, windows.no_starts()))
     each = (1 + sum(one.probes.shape[0] * one.probes.shape[1] for one in group) for group in groups)
-    return sum(each) * len(windows.trajectories)
+    return (sum(each) + RUNS) * len(windows.trajectories)
 
 
 def probes(
@@ -100,7 +101,7 @@ def probes(
     kept: Kept = NOTHING_KEPT,
     extensions: Sequence[Extension] | None = None,
 ) -> tuple[list[Probe], FloatArray, BoolArray]:
-    """Probes of extensions; none where the environment is no user's MJCF.
+    """Probes of extensions, and of a shorter physics step; none where the environment is no user's MJCF.
 
     Args:
         windows: the logs, W windows of L samples and C channels.
@@ -108,7 +109,7 @@ def probes(
         starts: (W, D) of the windows.
         tell: called with what is being done.
         kept: keeps what extensions do, group by group.
-        extensions: default all that the registry has.
+        extensions: default all that the registry has, and the physics step.
 
     Returns:
         The K probes that change what is observed; their effects (W, L, C, K) on the predictions; and whether the size
@@ -119,9 +120,25 @@ def probes(
     seen = effects(windows, theta, starts, _placed(windows, theta, starts, extensions), tell, kept)
     named = [probe for effect in seen for probe in _named(effect)]
     one_sided = [bounds(effect.placed.plain, effect.probes)[0] >= 0 for effect in seen]
-    nothing = np.zeros((*windows.observed.shape, 0))
-    changes = np.concatenate([nothing, *(_unit(effect.change) for effect in seen)], axis=-1)
-    return named, changes, np.concatenate([np.zeros(0, bool), *one_sided])
+    changes = [np.zeros((*windows.observed.shape, 0)), *(_unit(effect.change) for effect in seen)]
+    if extensions is None and (error := _step_error(windows, theta, starts, tell, kept)) is not None:
+        change = error.change[..., None]
+        whole = float(_size(change)[0])
+        named.append(Probe(PHYSICS_STEP.sentence(WORLD), error.remedy, False, WORLD, PHYSICS_STEP, whole))
+        changes.append(_unit(change))
+        one_sided.append(np.ones(1, bool))
+    return named, np.concatenate(changes, axis=-1), np.concatenate([np.zeros(0, bool), *one_sided])
+
+
+def _step_error(windows: Windows, theta: FloatArray, starts: FloatArray, tell: Tell, kept: Kept) -> StepError | None:
+    """What physics steps do to the predictions."""
+
+    def made(kept: Kept) -> tuple[StepError, ...]:
+        error = step_error(windows, theta, starts)
+        return () if error is None else (error,)
+
+    tell("simulating shorter physics steps")
+    return next(iter(kept.of("physics-step", tuple[StepError, ...], made)), None)
 
 
 def _placed(

@@ -18,7 +18,8 @@ few columns that were taken may stand in for others. So half of the interval is 
 discrepancy that the library spans (``misfit.library_discrepancy``). It is widened by the gains and the
 centres of mass that no motion tells (``misfit.tolerances``).
 
-Where nothing is seen to be missing, no further log is asked for: the posterior is widened by that discrepancy alone.
+Where nothing is seen to be missing, no further log is asked for: the posterior is widened by that discrepancy, and by
+what physics steps do, which no machine takes.
 
 Deviations:
 
@@ -41,7 +42,7 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.agreement import linear_estimates, parts_of
 from sipe_bayes.diagnostics.misfit.library_discrepancy import library_discrepancy
 from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs, remembering
-from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances, named, untold, widened
+from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances, named, untold, widened, without_steps
 from sipe_bayes.inference.random_effects import LogEstimate, random_effects
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
@@ -103,7 +104,10 @@ def missing_physics(
     """
     parts, hidden = parts_of(logs.windows), library_discrepancy(logs, seed)
     if not doubted:
-        return None if hidden is None else MissingPhysics(hidden.widened(posterior, seed), hidden.causes, True)
+        if hidden is None:
+            return None
+        further = without_steps(hidden.widened(posterior, seed), logs, tolerances, seed)
+        return MissingPhysics(further, hidden.causes, True)
     if len(parts) < 2:
         return None
     numbers = untold(logs, tolerances)

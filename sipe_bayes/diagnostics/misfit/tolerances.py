@@ -19,6 +19,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.posterior import Particles
+from sipe_bayes.structure.physics_step import PHYSICS_STEP
 from sipe_bayes.structure.probes import Probe
 
 IMITATED = 0.05  # of a column's information, that theta leaves
@@ -34,17 +35,24 @@ class Tolerances:
         geometry: of where a body's centre of mass lies, as a share of its ``reach`` (``structure.machine``), and of a
             mass that is not unknown, as a share of it.
         timing: of when a measurement was taken, as a share of the time from sample to sample.
+        physics_step: of what physics steps change, as a share of all that they do: a machine takes none.
     """
 
     commands: Mapping[str, float] = field(default_factory=dict)
     geometry: float = 0.0
     timing: float = 0.0
+    physics_step: float = 0.0
 
     def of(self, probe: Probe) -> float:
         """The sd of the number that a probe changes."""
         if probe.extension is None:
             return 0.0
-        shares = {"body": self.geometry, "channel": self.timing, "actuator": self.commands.get(probe.site, 0.0)}
+        shares = {
+            "body": self.geometry,
+            "channel": self.timing,
+            "actuator": self.commands.get(probe.site, 0.0),
+            PHYSICS_STEP.kind: self.physics_step,
+        }
         return shares.get(probe.extension.kind, 0.0)
 
 
@@ -54,7 +62,7 @@ COMMANDS, GEOMETRY, TIMING = 0.1, 0.05, 0.1  # the usual sds: of motor constants
 
 def usual(actuators: Sequence[str]) -> Tolerances:
     """Those of machines of which nobody has said more."""
-    return Tolerances(dict.fromkeys(actuators, COMMANDS), GEOMETRY, TIMING)
+    return Tolerances(dict.fromkeys(actuators, COMMANDS), GEOMETRY, TIMING, 1.0)
 
 
 @dataclass(frozen=True)
@@ -122,6 +130,28 @@ def tolerance_findings(logs: ProbedLogs, numbers: Sequence[Untold]) -> list[Find
     by = [f"{space[j].name} by {np.abs(np.diff(ends[:, j])).max():.2g} {space[j].unit}" for j in moved]
     names = [space[j].name for j in moved]
     return [finding(Code.UNTOLD, parameters=names, causes=" or ".join(causes), moved=", ".join(by))]
+
+
+def without_steps(further: Particles, logs: ProbedLogs, tolerances: Tolerances, seed: int) -> Particles:
+    """Draws of theta with what physics steps do to it, as far as the logs leave that open.
+
+    Of its share b a machine's is one and that of a simulated log may be zero: normal around zero beforehand, and as the
+    linear model of ``misfit.probed_logs`` then tells it where theta does not imitate almost all of it.
+    """
+    own = [k for k, probe in enumerate(logs.probes) if probe.extension is PHYSICS_STEP]
+    if not own or not tolerances.physics_step:
+        return further
+    (k,), logs = own, logs.discounted
+    seen, n = logs.seen, logs.windows.num_theta
+    whole = logs.arrow.precision[n + k, n + k]
+    told = whole - logs.arrow.precision[n + k, :n] @ seen.answer[:, k]
+    told, score = (told, seen.score[k]) if told > IMITATED * whole else (0.0, 0.0)
+    precision = told + 1 / (logs.probes[k].whole * tolerances.physics_step) ** 2
+    theta = further.theta.numpy()
+    normal = np.random.default_rng([seed, 2]).standard_normal(len(theta))
+    sizes = score / precision + normal / np.sqrt(precision)
+    shifted = np.clip(theta - sizes[:, None] * seen.answer[:, k], 0, 1)
+    return Particles(shifted, further.space, weights=further.weights.numpy())
 
 
 def widened(further: Particles, numbers: Sequence[Untold], seed: int) -> Particles:
