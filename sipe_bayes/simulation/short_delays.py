@@ -1,9 +1,8 @@
 """Commands that come late by less than a physics step.
 
 MuJoCo reads a delayed command before it stores the present one, so that any delay from above zero to one physics step
-acts as a whole one. Beyond that it is interpolated between the steps, and so it is here below: what a delay does is then
-continuous down to none. In commands (u_k) of physics steps of h seconds, a delay d < h lets u_k + d/h (u_{k-1} - u_k)
-act.
+acts as a whole one. Beyond that it is interpolated between the steps, and so it is here below: what a delay does is
+continuous down to none. Of commands u_k in steps of h seconds, a delay d < h lets u_k + d/h (u_{k-1} - u_k) act.
 """
 
 from __future__ import annotations

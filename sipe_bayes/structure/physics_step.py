@@ -91,7 +91,7 @@ def step_error(windows: Windows, theta: FloatArray, starts: FloatArray) -> StepE
             environment.added,
         )
         half = Simulator(finer, simulator.num_threads)
-    except ValueError:  # such as of a command history of the user's own that would be too short
+    except ValueError:  # what the user's MJCF has that depends on the step
         return None
     if windows.settings.starts != "estimated" and half.model.nhistory != simulator.model.nhistory:
         return None
@@ -112,4 +112,7 @@ def step_error(windows: Windows, theta: FloatArray, starts: FloatArray) -> StepE
 
 
 def _halved(spec: mujoco.MjSpec) -> None:
+    """With histories of commands and measurements that are as long as before."""
     spec.option.timestep /= 2
+    for owner in (*spec.actuators, *spec.sensors):
+        owner.nsample *= 2

@@ -1,0 +1,121 @@
+"""What a shorter physics step would change: exactly where it is known, named where a log shows it, and allowed for."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
+from sipe_bayes.diagnostics.misfit.misspecification import misfit
+from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
+from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances
+from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.inference import get_estimator
+from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.posterior import Particles, prior
+from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.structure.physics_step import RUNS, step_error
+from tests.problems.pendulums import DT, log, pendulum
+
+SLIDE = """
+<mujoco>
+  <option timestep="0.005" gravity="0 0 0"/>
+  <worldbody>
+    <body name="cart">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <geom size="0.1" mass="2" contype="0" conaffinity="0"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="x"{history}/></actuator>
+</mujoco>
+"""
+ALLOWED = Tolerances(physics_step=1.0)
+ONE = Parameter("mass", 1.0, 3.0, targets=("body:cart.mass",))
+
+
+def slide(history: str = "") -> Simulator:
+    xml = SLIDE.format(history=history)
+    return Simulator(MjcfEnvironment.build(xml, [ONE], ["push"], ["joint:x.position"]), 1)
+
+
+def pushed(simulator: Simulator, states: bool = False) -> Windows:
+    """A second, from .2 s on 6 N, which the mass of 2 kg follows by 3 m/s^2."""
+    actions = np.where(np.arange(50)[:, None] < 10, 0.0, 6.0)
+    motion = simulator.rollout([[0.5]], actions[None], np.atleast_2d(simulator.default_state()), dt=0.02)
+    known = Trajectory(motion.observations[0], actions, 0.02, motion.states[0] if states else None, "pushed")
+    settings = Segments(None, starts="recorded" if states else "estimated")
+    return Windows(settings, simulator, Trajectories.stack([known]))
+
+
+def lead_since(begin: float) -> FloatArray:
+    """What lacks of it where steps of 5 ms are none."""
+    return -3.0 * np.maximum(0.0, 0.02 * np.arange(51) - begin) * 0.005 / 2
+
+
+def test_eulers_steps_lead_by_half_a_step() -> None:
+    """x_n = a h^2 n (n + 1) / 2 where the machine has a t^2 / 2."""
+    windows = pushed(slide())
+    before = windows.rollouts
+    error = step_error(windows, np.array([0.5]), windows.no_starts())
+    assert error is not None
+    assert windows.rollouts - before == RUNS
+    assert error.timestep == 0.005
+    assert '"0.0025"' in error.remedy
+    np.testing.assert_allclose(error.change[0, :, 0], lead_since(0.2), atol=1e-12)
+
+
+def test_a_delay_of_the_models_own_stays_what_it_is() -> None:
+    """Of 20 ms, whose history of commands is then twice as long; recorded states do not tell it."""
+    late = slide(' delay="0.02" nsample="4" interp="linear"')
+    windows = pushed(late)
+    error = step_error(windows, np.array([0.5]), windows.no_starts())
+    assert error is not None
+    np.testing.assert_allclose(error.change[0, :, 0], lead_since(0.22), atol=1e-12)
+    for simulator, asked in ((slide(), True), (late, False)):
+        rows = pushed(simulator, states=True)
+        assert (step_error(rows, np.array([0.5]), rows.no_starts()) is not None) == asked
+
+
+def _timestep(spec: mujoco.MjSpec, seconds: float) -> None:
+    spec.option.timestep = seconds
+
+
+def fitted(step: float, seed: int) -> tuple[ProbedLogs, Particles, FloatArray]:
+    """A log of a pendulum in steps of so many seconds, fitted by one in steps of 10 ms."""
+    truth, simulator = pendulum(edits=[partial(_timestep, seconds=step)]), pendulum()
+    recorded = Trajectories.stack([log(truth, [0.6, 0.08], seed, sd=0.002)])
+    method = get_estimator(simulator, "laplace", restarts=1, candidates=0)
+    posterior = method.fit(recorded)
+    noise = Noise(np.array(method.diagnostics["noise_sd"]), np.array(method.diagnostics["noise_tau"]))
+    windows = bind(method.likelihood, simulator, recorded)
+    values = simulator.space.normalise(np.array([0.6, 0.08]))
+    drawn = Particles(posterior.sample((4000,), generator=torch.Generator().manual_seed(0)), simulator.space)
+    return ProbedLogs(windows, posterior.mode.numpy(), noise), drawn, values
+
+
+@pytest.mark.parametrize(("step", "shows"), [(DT / 20, True), (DT, False)])
+def test_a_machine_without_steps_is_told_from_one_with_the_models(step: float, shows: bool) -> None:
+    """False alarms at 1 %, and the seed is fixed."""
+    logs, drawn, values = fitted(step, 3)
+    seen = misfit(logs, drawn.stddev.numpy())
+    print(seen.text)
+    assert seen.alarm == shows
+    assert ("physics step" in seen.text) == shows
+    lacking = missing_physics(logs, drawn, prior(drawn.space), seen.alarm, 0, ALLOWED)
+    exact = missing_physics(logs, drawn, prior(drawn.space), seen.alarm, 0, EXACT)
+    assert lacking is not None
+    assert exact is not None
+    assert (lacking.further.variance >= exact.further.variance).all()
+    low, high = lacking.further.quantile([0.05, 0.95]).numpy()
+    print(low, values, high, drawn.quantile([0.05, 0.95]).numpy())
+    assert ((low <= values) & (values <= high)).all()
