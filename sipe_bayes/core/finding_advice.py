@@ -188,7 +188,8 @@ ADVICE: dict[Code, str] = {
         "Motion tells masses, inertias and friction only in the scale of the forces, with where they lie, and delays "
         "and a servo's gains with when each joint is read. Weigh one part and fix its mass with `actuator:NAME.gain` "
         "(a servo's `kp`) free; say by `tolerance` of the command how well forces are known, by `geometry_tolerance` "
-        "how well the drawing is, by `timing_tolerance` how well time stamps are."
+        "how well the drawing is, by `timing_tolerance` how well time stamps are. Where physics steps are named, write "
+        "shorter ones into the model (`<option timestep>`), or use the values in a simulation that takes the same."
     ),
     Code.COLUMN_NOT_FOLLOWED: "Look whether the fit follows it; else at its zero, unit and sign.",
     Code.CHECKS_THINNED: "Nothing to do; `sipe discover` looks at all of them.",
