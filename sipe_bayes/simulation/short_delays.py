@@ -14,7 +14,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.simulation.law_steps import Steps
 
 _WHOLE = 1 - 1e-9  # of a physics step: MuJoCo's own from here on
@@ -82,7 +82,8 @@ class ShortDelays:
 
     def __init__(self, model: mujoco.MjModel) -> None:
         late = (model.actuator_historyadr >= 0) & (model.actuator_history[:, 1] == 1) & (model.actuator_ctrlnum == 1)
-        self.buffers = [_Buffer.of(model, int(k)) for k in np.flatnonzero(late)]
+        self._actuators = np.flatnonzero(late)
+        self.buffers = [_Buffer.of(model, int(k)) for k in self._actuators]
 
     def __bool__(self) -> bool:
         return bool(self.buffers)
@@ -106,35 +107,39 @@ class ShortDelays:
             control_spec: of the controls.
             reads: whether sensordata is wanted.
         """
-        timestep = np.array([model.opt.timestep for model in models])
-        share = np.array([[model.actuator_delay[b.actuator] for b in self.buffers] for model in models])
-        share /= timestep[:, None]
+        distinct = {id(model): model for model in models}
+        rows = {key: (m.opt.timestep, *m.actuator_delay[self._actuators]) for key, m in distinct.items()}
+        timestep, *delays = np.array([rows[id(model)] for model in models]).T
+        share = np.stack(delays, axis=1) / timestep[:, None]
         short = (share > 0) & (share < _WHOLE)
         if not short.any():
             return steps(models, start, controls, control_spec, reads)
         inputs = controls.copy()
         for j, buffer in enumerate(self.buffers):
-            own, here = controls[:, :, buffer.control], np.flatnonzero(short[:, j])
-            before = np.concatenate([buffer.newest(start[here])[:, None], own[here, :-1]], axis=1)
-            inputs[here, :, buffer.control] += share[here, j, None] * (before - own[here])
-        with self._undelayed(models, short):
+            here = np.flatnonzero(short[:, j])
+            now = controls[here, :, buffer.control]
+            before = np.concatenate([buffer.newest(start[here])[:, None], now[:, :-1]], axis=1)
+            inputs[here, :, buffer.control] += share[here, j, None] * (before - now)
+        with self._undelayed(list(distinct.values())):
             states, sensors = steps(models, start, inputs, control_spec, reads)
         times = start[:, :1] + np.arange(controls.shape[1]) * timestep[:, None]
         for j, buffer in enumerate(self.buffers):
             here = np.flatnonzero(short[:, j])
-            late, own = states[here], controls[here, :, buffer.control]
-            stored(late, buffer.stamped, buffer.values, times[here], own, timestep[here])
+            late, commands = states[here], controls[here, :, buffer.control]
+            stored(late, buffer.stamped, buffer.values, times[here], commands, timestep[here])
             states[here] = late
         return states, sensors
 
     @contextmanager
-    def _undelayed(self, models: Sequence[mujoco.MjModel], short: BoolArray) -> Iterator[None]:
-        """Models without the delays that are short (B, n)."""
-        before = {id(model): (model, model.actuator_delay.copy()) for model in models}
+    def _undelayed(self, models: Sequence[mujoco.MjModel]) -> Iterator[None]:
+        """Distinct models without their short delays."""
+        before = [model.actuator_delay.copy() for model in models]
         try:
-            for model, row in zip(models, short, strict=True):
-                model.actuator_delay[[b.actuator for b, own in zip(self.buffers, row, strict=True) if own]] = 0.0
+            for model in models:
+                delay = model.actuator_delay[self._actuators]
+                short = delay < _WHOLE * model.opt.timestep
+                model.actuator_delay[self._actuators] = np.where(short, 0.0, delay)
             yield
         finally:
-            for model, delay in before.values():
+            for model, delay in zip(models, before, strict=True):
                 model.actuator_delay[:] = delay

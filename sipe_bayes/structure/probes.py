@@ -85,7 +85,7 @@ class _Change:
 
 
 def probes_cost(windows: Windows, theta: FloatArray) -> int:
-    """Rollouts that ``probes`` takes, but for extensions that do not go together; exact where it is at this theta."""
+    """Rollouts that ``probes`` takes, but for extensions that do not go together; at this theta at most."""
     if not isinstance(windows.simulator.environment, MjcfEnvironment):
         return 0
     groups = _groups(_placed(windows, theta, windows.no_starts()))

@@ -11,11 +11,12 @@ import torch
 import sipe_bayes as sipe
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import BudgetTooSmall, Segments
 from sipe_bayes.simulation.simulator import Simulator
-from tests.problems.pendulums import coloured, log, pendulum
+from tests.problems.pendulums import XML, coloured, log, pendulum
 
 CART = """
 <mujoco>
@@ -183,3 +184,14 @@ def test_a_delay_of_none_is_found(likelihood: Any) -> None:
         assert low[2] < 0.0005
         assert low[0] < 0.6 < high[0]
         assert low[1] < 0.1 < high[1]
+
+
+def test_a_delay_alone_is_fitted() -> None:
+    """All differences are then as long as a physics step. An interval of 99 %, and the seed is fixed."""
+    delay = Parameter("delay", 0.0, 0.05, targets=("actuator:motor.delay",))
+    alone = Simulator(MjcfEnvironment.build(XML, [delay], ["motor"], ["joint:hinge.position"]), num_threads=1)
+    recorded = log(alone, [0.013], 2, steps=200)
+    posterior = get_estimator(alone, "laplace", restarts=1, candidates=0).fit(recorded)
+    low, high = alone.space.values(posterior.quantile([0.005, 0.995]).numpy())[:, 0]
+    assert low < 0.013 < high
+    assert high - low < 0.02

@@ -35,6 +35,8 @@ Deviations:
 - All at work have sizes of either sign, also extensions that have but one: they stand for what no extension is, too.
 - Columns that theta imitates almost wholly are left out: of those no residual tells the size (``misfit.tolerances``
   has those that matter). So are gains of single logs.
+- What physics steps do, where there is a tolerance, is no piece that may be missing: its size is normal around zero, by
+  ``Tolerances.physics_step``, between a machine's, which takes none, and that of a simulated log.
 """
 
 from __future__ import annotations
@@ -47,12 +49,14 @@ import numpy as np
 import scipy.special
 import torch
 
-from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
-from sipe_bayes.diagnostics.misfit.tolerances import IMITATED
+from sipe_bayes.diagnostics.misfit.tolerances import EXACT, IMITATED, Tolerances
 from sipe_bayes.posterior import GaussianMixture, Particles, Posterior
 from sipe_bayes.posterior.truncated_normal import interval_quantile
+from sipe_bayes.structure.physics_step import PHYSICS_STEP
+from sipe_bayes.structure.probes import Probe
 
 _NOTHING = 1e-100  # information of a column that moves nothing
 _FAR = 40.0  # sds beyond which a normal has no mass
@@ -112,13 +116,16 @@ class Discrepancy:
         return GaussianMixture(log_weights, posterior.means, covariances, posterior.space).of_masses()
 
 
-def library_discrepancy(logs: ProbedLogs, seed: int = 0, options: DiscrepancyOptions = _OPTIONS) -> Discrepancy | None:
+def library_discrepancy(
+    logs: ProbedLogs, seed: int = 0, options: DiscrepancyOptions = _OPTIONS, tolerances: Tolerances = EXACT
+) -> Discrepancy | None:
     """The discrepancy's posterior, in closed form; no simulation beside what ``logs`` took.
 
     Args:
         logs: linearised at the estimate.
         seed: of the draws.
         options: of the prior.
+        tolerances: of which that of physics steps is asked.
 
     Returns:
         None where no extension does what theta cannot.
@@ -129,15 +136,24 @@ def library_discrepancy(logs: ProbedLogs, seed: int = 0, options: DiscrepancyOpt
     whole, cross = logs.arrow.precision[n:, n:], logs.arrow.precision[n:, :n]
     information = whole - cross @ seen.answer
     size, full = np.diag(information), np.diag(whole)
+    steps = [k for k, probe in enumerate(logs.probes) if probe.extension is PHYSICS_STEP and tolerances.of(probe)]
     able = [not p.by_log and f > _NOTHING and s > IMITATED * f for p, s, f in zip(logs.probes, size, full, strict=True)]
-    kept = np.flatnonzero(able)
-    if not len(kept):
+    kept = np.array([k for k in np.flatnonzero(able) if k not in steps], int)
+    if not len(kept) and not steps:
         return None
-    names = [logs.probes[k].name for k in kept]
-    columns = Columns(names, information[np.ix_(kept, kept)], seen.score[kept], logs.one_sided[kept])
-    drawn, _, one = columns.draws(options, np.random.default_rng(seed))
+    beside = [_Beside.of(logs.probes[k], tolerances, kept, k, information, seen.score, able[k]) for k in steps]
+    shared, score = information[np.ix_(kept, kept)], seen.score[kept]
+    for step in beside:
+        shared, score = step.without(shared, score)
+    names, random = [logs.probes[k].name for k in kept], np.random.default_rng(seed)
+    drawn, one = np.zeros((options.draws, 0)), np.zeros(options.draws, bool)
+    if len(kept):
+        drawn, _, one = Columns(names, shared, score, logs.one_sided[kept]).draws(options, random)
     sizes = np.zeros((len(drawn), len(logs.probes)))
     sizes[:, kept] = drawn
+    for k, step in zip(steps, beside, strict=True):
+        sizes[:, k] = step.draws(drawn, random)
+        names.append(logs.probes[k].name)
 
     def moved(name: str | None = None) -> FloatArray:
         """Theta (M, N), by all extensions or by one."""
@@ -147,6 +163,48 @@ def library_discrepancy(logs: ProbedLogs, seed: int = 0, options: DiscrepancyOpt
     square = {name: (moved(name) ** 2).mean(0) / np.maximum(seen.variance, 1e-300) for name in dict.fromkeys(names)}
     most = sorted(square, key=lambda name: -float(square[name].sum()))
     return Discrepancy(moved(), stretch, tuple(most[: options.causes]))
+
+
+@dataclass(frozen=True)
+class _Beside:
+    """What physics steps do, a column whose size is known beforehand, beside K others whose are not.
+
+    Args:
+        score: its own.
+        precision: of its size, told and known.
+        shared: (K,) information with the others.
+    """
+
+    score: float
+    precision: float
+    shared: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        probe: Probe,
+        tolerances: Tolerances,
+        kept: IntArray,
+        k: int,
+        information: FloatArray,
+        score: FloatArray,
+        told: bool,
+    ) -> _Beside:
+        """Of column k; the logs are not asked where theta imitates it almost wholly, as of all such columns."""
+        known = 1 / (probe.whole * tolerances.of(probe)) ** 2
+        if not told:
+            return cls(0.0, known, np.zeros(len(kept)))
+        return cls(float(score[k]), known + float(information[k, k]), information[k, kept])
+
+    def without(self, information: FloatArray, score: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Information (K, K) and score (K,) of the others where this one is integrated out."""
+        share = self.shared / self.precision
+        return information - np.outer(share, self.shared), score - share * self.score
+
+    def draws(self, others: FloatArray, random: np.random.Generator) -> FloatArray:
+        """Of its size (M,), beside sizes (M, K) of the others."""
+        mean = (self.score - others @ self.shared) / self.precision
+        return np.asarray(mean + random.standard_normal(len(others)) / np.sqrt(self.precision))
 
 
 @dataclass(frozen=True)

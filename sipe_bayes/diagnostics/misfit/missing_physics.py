@@ -42,7 +42,7 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.agreement import linear_estimates, parts_of
 from sipe_bayes.diagnostics.misfit.library_discrepancy import library_discrepancy
 from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs, remembering
-from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances, named, untold, widened, without_steps
+from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances, named, untold, widened
 from sipe_bayes.inference.random_effects import LogEstimate, random_effects
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
@@ -102,12 +102,9 @@ def missing_physics(
     Returns:
         None where nothing can be said: no extension has an effect, or in doubt there is but a single log of one window.
     """
-    parts, hidden = parts_of(logs.windows), library_discrepancy(logs, seed)
+    parts, hidden = parts_of(logs.windows), library_discrepancy(logs, seed, tolerances=EXACT if doubted else tolerances)
     if not doubted:
-        if hidden is None:
-            return None
-        further = without_steps(hidden.widened(posterior, seed), logs, tolerances, seed)
-        return MissingPhysics(further, hidden.causes, True)
+        return None if hidden is None else MissingPhysics(hidden.widened(posterior, seed), hidden.causes, True)
     if len(parts) < 2:
         return None
     numbers = untold(logs, tolerances)

@@ -69,7 +69,9 @@ class Solved:
         left: (W, L, C) of the residual.
         step: (N + K,) of theta; zero of the probes.
         score: (K,) of each probe.
-        information: (K,) of each probe, all else projected out.
+        information: (K,) of each probe, all else projected out; infinite of one whose size would be negative, or that
+            theta can imitate.
+        told: (K,) the same of all.
         answer: (N, K) of theta to the probes.
         variance: (N,) of theta.
     """
@@ -79,6 +81,7 @@ class Solved:
     step: FloatArray
     score: FloatArray
     information: FloatArray
+    told: FloatArray
     answer: FloatArray
     variance: FloatArray
 
@@ -261,14 +264,14 @@ class ProbedLogs:
         base, cross = inverse @ (arrow.gradient + (0.0 if pull is None else pull)), inverse @ probed.cross
         # score and information of each probe with theta projected out; one that theta can imitate is not usable
         gradient, whole = probed.gradient - probed.cross.T @ base, probed.information + FLAT_PRECISION
-        information = whole - np.einsum("ik,ik->k", probed.cross, cross)
-        usable = information > 1e-6 * whole + 2 * FLAT_PRECISION
-        information = np.where(usable & ~(self.one_sided & (gradient < 0)), information, np.inf)
+        told = whole - np.einsum("ik,ik->k", probed.cross, cross)
+        usable = told > 1e-6 * whole + 2 * FLAT_PRECISION
+        information = np.where(usable & ~(self.one_sided & (gradient < 0)), told, np.inf)
         # what theta and starts leave, whitened by channel
         step = np.concatenate([base, np.zeros(self.count - n)])
         left = self.left(residual, step, arrow.blocks(base))
         statistics = np.concatenate([np.cbrt(gradient**2 / information), self.whiteness(left, noise)])
-        return Solved(statistics, left, step, gradient, information, cross, np.diag(inverse))
+        return Solved(statistics, left, step, gradient, information, told, cross, np.diag(inverse))
 
     def whiteness(self, residual: FloatArray, noise: Noise) -> FloatArray:
         """Cube roots (2 C,) of what a residual (W, L, C) has of autocorrelation, and of its largest mean squares."""

@@ -47,22 +47,20 @@ class Tolerances:
         """The sd of the number that a probe changes."""
         if probe.extension is None:
             return 0.0
-        shares = {
-            "body": self.geometry,
-            "channel": self.timing,
-            "actuator": self.commands.get(probe.site, 0.0),
-            PHYSICS_STEP.kind: self.physics_step,
-        }
+        if probe.extension is PHYSICS_STEP:
+            return self.physics_step
+        shares = {"body": self.geometry, "channel": self.timing, "actuator": self.commands.get(probe.site, 0.0)}
         return shares.get(probe.extension.kind, 0.0)
 
 
 EXACT = Tolerances()
 COMMANDS, GEOMETRY, TIMING = 0.1, 0.05, 0.1  # the usual sds: of motor constants, of drawings, of loops that read joints
+PHYSICS_STEPS = 1.0  # between a machine without any and a simulated log in the model's own
 
 
 def usual(actuators: Sequence[str]) -> Tolerances:
     """Those of machines of which nobody has said more."""
-    return Tolerances(dict.fromkeys(actuators, COMMANDS), GEOMETRY, TIMING, 1.0)
+    return Tolerances(dict.fromkeys(actuators, COMMANDS), GEOMETRY, TIMING, PHYSICS_STEPS)
 
 
 @dataclass(frozen=True)
@@ -98,8 +96,7 @@ def untold(logs: ProbedLogs, tolerances: Tolerances) -> list[Untold]:
     numbers = []
     for k, probe in enumerate(logs.probes):
         sd = tolerances.of(probe)
-        determined = seen.information[k] < np.inf and seen.information[k] > IMITATED * whole[k]
-        if sd and np.isfinite(probe.whole) and not determined:
+        if sd and np.isfinite(probe.whole) and seen.told[k] <= IMITATED * whole[k]:
             numbers.append(Untold(probe, sd, -seen.answer[:, k] * probe.whole * sd))
     return numbers
 
@@ -130,28 +127,6 @@ def tolerance_findings(logs: ProbedLogs, numbers: Sequence[Untold]) -> list[Find
     by = [f"{space[j].name} by {np.abs(np.diff(ends[:, j])).max():.2g} {space[j].unit}" for j in moved]
     names = [space[j].name for j in moved]
     return [finding(Code.UNTOLD, parameters=names, causes=" or ".join(causes), moved=", ".join(by))]
-
-
-def without_steps(further: Particles, logs: ProbedLogs, tolerances: Tolerances, seed: int) -> Particles:
-    """Draws of theta with what physics steps do to it, as far as the logs leave that open.
-
-    Of its share b a machine's is one and that of a simulated log may be zero: normal around zero beforehand, and as the
-    linear model of ``misfit.probed_logs`` then tells it where theta does not imitate almost all of it.
-    """
-    own = [k for k, probe in enumerate(logs.probes) if probe.extension is PHYSICS_STEP]
-    if not own or not tolerances.physics_step:
-        return further
-    (k,), logs = own, logs.discounted
-    seen, n = logs.seen, logs.windows.num_theta
-    whole = logs.arrow.precision[n + k, n + k]
-    told = whole - logs.arrow.precision[n + k, :n] @ seen.answer[:, k]
-    told, score = (told, seen.score[k]) if told > IMITATED * whole else (0.0, 0.0)
-    precision = told + 1 / (logs.probes[k].whole * tolerances.physics_step) ** 2
-    theta = further.theta.numpy()
-    normal = np.random.default_rng([seed, 2]).standard_normal(len(theta))
-    sizes = score / precision + normal / np.sqrt(precision)
-    shifted = np.clip(theta - sizes[:, None] * seen.answer[:, k], 0, 1)
-    return Particles(shifted, further.space, weights=further.weights.numpy())
 
 
 def widened(further: Particles, numbers: Sequence[Untold], seed: int) -> Particles:

@@ -119,15 +119,16 @@ def summarised(problem: SearchProblem, windows: Windows, ending: Ending) -> Wind
 def widened(problem: SearchProblem, windows: Windows, ending: Ending) -> WindowOptimum:
     """The same, by differences as long as the normal is wide where that makes it wider; see ``wide_differences``.
 
-    Not asked where the starts are known, where an end is none, or windows grow.
+    Not asked where the starts are known, where an end is none, where windows grow or all differences are long already.
     """
     optimum, tuning = summarised(problem, windows, ending), problem.options.tuning.wide
     ends = ending.settled and ending.refused <= problem.options.tuning.windows.most_drift
-    if not ends or not windows.num_start or grows(windows):
+    short = windows.least_steps(ending.theta) == 0
+    if not ends or not windows.num_start or grows(windows) or not short.any():
         return optimum
     missing = 0.0
     for _ in range(tuning.rounds):
-        if not windows.has_room(2 * len(ending.theta)):
+        if not windows.has_room(2 * int(short.sum())):
             break
         seen = WideDifferences.of(problem, windows, optimum, ending.noise, ending.residual, ending.jacobian)
         lin = Linearisation(ending.residual, seen.jacobian, True)

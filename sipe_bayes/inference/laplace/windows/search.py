@@ -12,9 +12,6 @@ from place to place, and the place would otherwise be an accident of the start.
 Of bodies that tumble and land, theta and the starts descend together on beginnings of the windows that grow
 (``growing_windows``).
 
-An optimum at which differences have been too short to see what a parameter does (a delay below two physics steps) is
-searched on with longer ones.
-
 Where the starts are recorded and theta alone is searched, points around each optimum are tried as well
 (``pattern_search``), and the search goes on from a better one, with finite differences no longer than the way there.
 The normal that is left is no narrower than the shortest of these ways, and holds the points that fit as well as the

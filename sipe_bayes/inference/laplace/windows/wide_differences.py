@@ -79,5 +79,5 @@ class WideDifferences:
         middle = theta - optimum.mean
         foretold = 0.5 * (np.einsum("bi,ij,bj->b", gaps, precision, gaps) - middle @ precision @ middle)
         narrow = falls + tuning.slack < tuning.least_fall * (foretold + tuning.slack)
-        missing = float(np.where(narrow, foretold - falls, 0.0).max(initial=0.0))
+        missing = float(np.where(narrow, foretold - falls, 0.0).max())
         return cls(np.concatenate([wide, by_starts], axis=-1), missing)
