@@ -45,7 +45,7 @@ from sipe_bayes.calibration.readers.many import episodes_of
 from sipe_bayes.core.files import read_text, reading
 from sipe_bayes.core.units import find_unit
 from sipe_bayes.core.validation import MOST
-from sipe_bayes.diagnostics.misfit.tolerances import GEOMETRY, TIMING
+from sipe_bayes.diagnostics.misfit.tolerances import GEOMETRY, PHYSICS_STEPS, TIMING
 
 
 class Config(Table):
@@ -76,6 +76,9 @@ class Config(Table):
     timing_tolerance: Tolerance = TIMING
     """sd of when each measurement is taken, as a share of the time from sample to sample: loops read one joint after
     the other. Intervals with what the model lacks allow for it where no log tells. 0: exact"""
+    step_tolerance: Tolerance = PHYSICS_STEPS
+    """what physics steps change, as a share of all that they do: a machine takes none. Intervals with what the model
+    lacks or may lack allow for it. 0: for logs in the model's own steps, of which they are but one more piece"""
     search: Search = Search()
     resample: Resample = Resample()
     columns: Columns = Columns()

@@ -23,7 +23,7 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.units import find_unit, to_si
 from sipe_bayes.core.validation import nearest_name
-from sipe_bayes.diagnostics.misfit.tolerances import PHYSICS_STEPS, Tolerances
+from sipe_bayes.diagnostics.misfit.tolerances import Tolerances
 from sipe_bayes.diagnostics.records import LogReport
 from sipe_bayes.envs.added import of_logs
 from sipe_bayes.envs.channels import Channel
@@ -80,7 +80,8 @@ class Problem:
     def tolerances(self) -> Tolerances:
         """How well forces, drawings and times are known."""
         commands = {command.actuator: command.tolerance for command in self.config.commands}
-        return Tolerances(commands, self.config.geometry_tolerance, self.config.timing_tolerance, PHYSICS_STEPS)
+        shares = self.config.geometry_tolerance, self.config.timing_tolerance, self.config.step_tolerance
+        return Tolerances(commands, *shares)
 
     @property
     def segments(self) -> Segments:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 
+import sipe_bayes as sipe
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
-from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances, tolerance_findings, untold
+from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances, tolerance_findings, untold, usual
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.settings import Segments
@@ -19,6 +23,7 @@ from sipe_bayes.posterior import Particles, prior
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.pendulums import XML, log, pendulum
 
+EXAMPLES = Path(__file__).parents[3] / "examples"
 GAIN, TOLERANCES = 1.1, Tolerances({"motor": 0.1})
 
 
@@ -135,3 +140,11 @@ def test_what_a_measurement_is_taken_later_the_delay_of_the_commands_is_shorter(
     late = 0.05 * float(logs.dt[0])
     np.testing.assert_allclose(simulator.space.values(seen.theta + opened.shift)[2] - 0.02, -late, rtol=0.1)
     assert opened.sentence.endswith("that is taken 5 % of a sample off")
+
+
+def test_a_configuration_says_them_all() -> None:
+    problem = sipe.prepare(EXAMPLES / "simple_pendulum" / "calibrate.toml")
+    assert problem.tolerances == usual(problem.environment.actuators)
+    given = {"geometry_tolerance": 0.2, "timing_tolerance": 0.3, "step_tolerance": 0.0}
+    own = replace(problem, config=problem.config.model_copy(update=given)).tolerances
+    assert own == Tolerances(usual(problem.environment.actuators).commands, 0.2, 0.3, 0.0)
