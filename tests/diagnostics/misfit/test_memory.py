@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import functools
+
 import numpy as np
 import pytest
 
@@ -18,11 +21,18 @@ from tests.problems.pendulums import log, pendulum
 SD = 0.01
 
 
-def probed(memory: float, seed: int) -> ProbedLogs:
-    """Two logs whose fit takes noise for white; what it leaves is AR(1), its autocorrelation time ``memory``."""
+@functools.cache
+def linearised() -> ProbedLogs:
+    """Two logs whose fit takes noise for white."""
     theta = pendulum().space.normalise(np.array([0.6, 0.08]))
     logs = Trajectories.stack([log(pendulum(), [0.6, 0.08], number, name=str(number)) for number in (2, 3)])
-    out = ProbedLogs(bind(Segments(2.0), pendulum(), logs), theta, Noise(np.array([SD]), np.zeros(1)))
+    return ProbedLogs(bind(Segments(2.0), pendulum(), logs), theta, Noise(np.array([SD]), np.zeros(1)))
+
+
+def probed(memory: float, seed: int) -> ProbedLogs:
+    """The same where what the fit leaves is AR(1), its autocorrelation time ``memory``."""
+    out = copy.copy(linearised())
+    out.__dict__.pop("arrow")  # of the logs' own residual
     rho, random = (memory - 1) / (memory + 1), np.random.default_rng(seed)
     flat = random.standard_normal(out.residual.size)
     for i in range(1, len(flat)):
