@@ -104,3 +104,12 @@ def test_what_no_simulation_keeps_counts_neither_for_the_noise_nor_for_the_optim
     assert quiet.finding is not None
     assert quiet.finding.code is Code.KINK
     assert (quiet.covariance == judgement.covariance).all()
+
+    # along the promised way as far as the cube, not across its corner
+    n = len(ending.theta)
+    way = np.full(n, 0.01)
+    way[0] = 10 * (1 - ending.theta[0])
+    far = judged(
+        method.problem, windows, replace(broken, mean=ending.theta + way), None, replace(promising, refused=100.0)
+    )
+    np.testing.assert_allclose(far.covariance - broken.covariance, np.outer(way, way) / 100, atol=1e-12)

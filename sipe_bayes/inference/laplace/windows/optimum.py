@@ -38,6 +38,8 @@ from sipe_bayes.likelihood.noise_spread import noise_cloud, sandwich
 from sipe_bayes.likelihood.restricted import eliminate_starts, restricted
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 
+_HELD = 1e-6  # of the cube: a parameter that the search left on its bound
+
 
 @dataclass(frozen=True)
 class Ending:
@@ -242,10 +244,18 @@ def judged(
     if is_broken(problem, windows, ending.theta, ending.refused):
         reason = reason or finding(Code.KINK, gain=ending.refused)
         # the normal's middle lies where a slope led that no simulation follows
-        refused = np.clip(optimum.mean, 0.0, 1.0) - ending.theta
+        refused = _within_cube(ending.theta, optimum.mean - ending.theta)
         optimum, covariance = replace(optimum, mean=ending.theta), covariance + np.outer(refused, refused)
     heavier = around is not None and around.heavier
     return replace(optimum, covariance=covariance, guessed=guessed, heavier=heavier, finding=reason)
+
+
+def _within_cube(theta: FloatArray, way: FloatArray) -> FloatArray:
+    """As much of a way (N,) from theta (N,) as the cube leaves, along it; parameters at a bound are held there."""
+    room = np.where(way > 0, 1 - theta, theta)
+    moves = (room > _HELD) & (np.abs(way) > 0)
+    share = min(1.0, float((room[moves] / np.abs(way[moves])).min(initial=1.0)))
+    return np.where(moves, share * way, 0.0)
 
 
 def not_followed(windows: Windows, sd: FloatArray) -> tuple[str, float] | None:
