@@ -7,8 +7,9 @@ Logs of a torque-driven pendulum (4 s, 100 Hz, angle with noise of sd 0.01 rad, 
 and damping unknown, fitted by `laplace`. Left out of the model, in three sizes: dry friction of 0.03, 0.06 and 0.12 N
 m, a delay of the command of 10, 20 and 40 ms, friction of 5, 10 and 20 % of the torque applied; the torque is a sum of
 four sines of 0.6 N m. The null is the right model. Beside it a double pendulum with a motor, two unknowns and a channel
-at each joint, and the effect, of the middle size, at one of them in turn: there the cause that is named has to be the
-right one at the right joint. An alarm is p <= 0.05. Every fit is one line in runs/, so an interrupted study goes on.
+at each joint, and the effect, of the middle size, at one of them in turn. The right cause at the right joint has to be
+among those that are named, which explain about as much, three at most. An alarm is p <= 0.05. Every fit is one line in
+runs/, so an interrupted study goes on.
 """
 
 from __future__ import annotations
@@ -120,7 +121,8 @@ def study(engine: sipe.Simulator, cell: str, size: float, noise: str, seeds: int
     rows = rows[:seeds]
     alarms = [row for row in rows if row["p"] <= THRESHOLDS.misfit]
     causes = [row["cause"] for row in alarms]
-    right = [row for row in alarms if row["cause"] == cause_of(cell, row["seed"] % joints)]
+    # causes that explain about as much are named together
+    right = [row for row in alarms if cause_of(cell, row["seed"] % joints) in row["cause"].split(" or ")]
     channel = [row for row in alarms if row["channel"] == f"joint:hinge{1 + row['seed'] % joints}.position"]
     return {
         "cell": cell,
