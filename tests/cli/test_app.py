@@ -50,6 +50,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory, log: pd.DataFrame) -> tup
     """(config, output folder, the subprocess's result) of a run with --json."""
     folder = tmp_path_factory.mktemp("finished")
     config = write_case(folder, log)
+    text("window = 0.5\n", "window = 0.5\nstep_tolerance = 0.0  # a log in the model's own steps\n")(folder)
     result = sipe_command(folder, config, "--json", "--out", folder / "out")
     assert result.returncode == 0, result.stderr
     return config, folder / "out", result
