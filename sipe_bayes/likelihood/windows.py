@@ -38,7 +38,6 @@ from sipe_bayes.likelihood.starts.estimates import (
 )
 from sipe_bayes.likelihood.starts.filters import FilterStarts
 from sipe_bayes.likelihood.starts.history import past_commands, with_history
-from sipe_bayes.likelihood.theta_differences import ThetaDifferences
 from sipe_bayes.simulation.contacts import Contacts
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import moved
@@ -333,8 +332,6 @@ class Windows:
     ) -> Linearisation:
         """Residual and Jacobian: one batch of N + D + 1 simulations of the logs, in float64.
 
-        And M more, for parameters with a least step: see ``theta_differences``.
-
         Args:
             theta: (N,), where.
             starts: (W, D), where.
@@ -347,13 +344,13 @@ class Windows:
         Raises:
             BudgetExhausted: instead of simulating beyond the budget.
         """
-        d, least = (self.num_start if with_starts else 0), self.least_steps(theta)
-        size = np.maximum(self.theta_step if theta_step is None else theta_step, least)
-        steps = ThetaDifferences.of(theta, size, least)
-        n, points = (len(theta), steps.points) if with_theta else (0, np.zeros((0, len(theta))))
+        n, d = (self.num_theta if with_theta else 0), (self.num_start if with_starts else 0)
+        size = np.maximum(self.theta_step if theta_step is None else theta_step, self.least_steps(theta))
         of_starts = np.broadcast_to(start_step, self.num_start)[:d]
-        thetas = np.concatenate([theta[None], points[:n], np.tile(theta, (d, 1)), points[n:]])
-        all_starts, count = np.tile(starts, (len(thetas), 1, 1)), n + d + 1
+        sign = np.where(theta + size <= 1, 1.0, -1.0)
+        thetas, all_starts = np.tile(theta, (n + d + 1, 1)), np.tile(starts, (n + d + 1, 1, 1))
+        for j in range(n):
+            thetas[j + 1, j] += sign[j] * size[j]
         for j in range(d):
             all_starts[n + 1 + j, :, j] += of_starts[j]
         if residual is None:
@@ -362,18 +359,18 @@ class Windows:
             here = np.where(self.observed, self.measured - residual, np.nan)
             predicted, valid = self.predict(thetas[1:], all_starts[1:], True)
             predicted, valid = np.concatenate([here[None], predicted]), np.append(True, valid)
-        begin, both = np.repeat(predicted[:1], count - 1, axis=0), steps.both[: len(points) - n]
-        wrong = np.flatnonzero(~valid[1 : n + 1])
-        if len(wrong) and valid[0]:  # across a physical limit: look the other way
-            steps = steps.other_way(wrong)
-            predicted[wrong + 1], valid[wrong + 1] = self.predict(steps.points[wrong], all_starts[: len(wrong)], True)
+        wrong = [j for j in range(n) if not valid[j + 1]]
+        # a step across a physical limit: look the other way
+        if wrong and valid[0]:
+            sign[wrong] = -sign[wrong]
+            again, rows = np.tile(theta, (len(wrong), 1)), np.array(wrong) + 1
+            again[np.arange(len(wrong)), wrong] += sign[wrong] * size[wrong]
+            predicted[rows], valid[rows] = self.predict(np.clip(again, 0, 1), all_starts[: len(wrong)], True)
         predicted[1:] = self.continued(predicted[1:], predicted[0])
-        used = valid[count:] & np.isin(both, steps.both)
-        begin[both[used]] = predicted[count:][used]
-        length = np.append(np.where(np.isin(np.arange(n), both[used]), steps.length[:n], steps.ahead[:n]), of_starts)
+        scale = np.concatenate([sign[:n] * size[:n], of_starts])[:, None, None, None]
         with np.errstate(invalid="ignore"):
-            jacobian = (predicted[1:count] - begin) / length[:, None, None, None]
-        jacobian = np.where(self.observed & valid[1:count, None, None, None], jacobian, 0.0)
+            jacobian = (predicted[1:] - predicted[0]) / scale
+        jacobian = np.where(self.observed & valid[1:, None, None, None], jacobian, 0.0)
         residual = np.where(self.observed, self.measured - predicted[0], 0.0)
         return Linearisation(residual, np.moveaxis(jacobian, 0, -1), bool(valid[0]))
 
