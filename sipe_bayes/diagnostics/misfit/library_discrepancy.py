@@ -188,11 +188,11 @@ class _Beside:
         k: int,
         information: FloatArray,
         score: FloatArray,
-        told: bool,
+        determined: bool,
     ) -> _Beside:
         """Of column k; the logs are not asked where theta imitates it almost wholly, as of all such columns."""
         known = 1 / (probe.whole * tolerances.of(probe)) ** 2
-        if not told:
+        if not determined:
             return cls(0.0, known, np.zeros(len(kept)))
         return cls(float(score[k]), known + float(information[k, k]), information[k, kept])
 

@@ -71,7 +71,7 @@ class Solved:
         score: (K,) of each probe.
         information: (K,) of each probe, all else projected out; infinite of one whose size would be negative, or that
             theta can imitate.
-        told: (K,) the same of all.
+        two_sided: (K,) the same of all, whatever their sign.
         answer: (N, K) of theta to the probes.
         variance: (N,) of theta.
     """
@@ -81,7 +81,7 @@ class Solved:
     step: FloatArray
     score: FloatArray
     information: FloatArray
-    told: FloatArray
+    two_sided: FloatArray
     answer: FloatArray
     variance: FloatArray
 
@@ -264,14 +264,14 @@ class ProbedLogs:
         base, cross = inverse @ (arrow.gradient + (0.0 if pull is None else pull)), inverse @ probed.cross
         # score and information of each probe with theta projected out; one that theta can imitate is not usable
         gradient, whole = probed.gradient - probed.cross.T @ base, probed.information + FLAT_PRECISION
-        told = whole - np.einsum("ik,ik->k", probed.cross, cross)
-        usable = told > 1e-6 * whole + 2 * FLAT_PRECISION
-        information = np.where(usable & ~(self.one_sided & (gradient < 0)), told, np.inf)
+        two_sided = whole - np.einsum("ik,ik->k", probed.cross, cross)
+        usable = two_sided > 1e-6 * whole + 2 * FLAT_PRECISION
+        information = np.where(usable & ~(self.one_sided & (gradient < 0)), two_sided, np.inf)
         # what theta and starts leave, whitened by channel
         step = np.concatenate([base, np.zeros(self.count - n)])
         left = self.left(residual, step, arrow.blocks(base))
         statistics = np.concatenate([np.cbrt(gradient**2 / information), self.whiteness(left, noise)])
-        return Solved(statistics, left, step, gradient, information, told, cross, np.diag(inverse))
+        return Solved(statistics, left, step, gradient, information, two_sided, cross, np.diag(inverse))
 
     def whiteness(self, residual: FloatArray, noise: Noise) -> FloatArray:
         """Cube roots (2 C,) of what a residual (W, L, C) has of autocorrelation, and of its largest mean squares."""

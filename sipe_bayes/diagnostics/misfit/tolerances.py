@@ -96,7 +96,7 @@ def untold(logs: ProbedLogs, tolerances: Tolerances) -> list[Untold]:
     numbers = []
     for k, probe in enumerate(logs.probes):
         sd = tolerances.of(probe)
-        if sd and np.isfinite(probe.whole) and seen.told[k] <= IMITATED * whole[k]:
+        if sd and np.isfinite(probe.whole) and seen.two_sided[k] <= IMITATED * whole[k]:
             numbers.append(Untold(probe, sd, -seen.answer[:, k] * probe.whole * sd))
     return numbers
 
