@@ -79,7 +79,7 @@ class Sensing:
             observations = _filtered(observations, self.filter, dt[:, None])
         if (self.scale != 1.0).any():
             observations = self.scale[:, None] * observations
-        return observations + self.bias[:, None]
+        return observations + self.bias[:, None] if self.bias.any() else observations
 
 
 def delayed(y: FloatArray, samples: FloatArray, rotations: Sequence[tuple[int, int, int]] = ()) -> FloatArray:
