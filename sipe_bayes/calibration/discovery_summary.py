@@ -79,7 +79,8 @@ def summarise(
     averaged = Marginals.of(structures.posterior, problem.prior, seed)
     plain, left = before.stage(seed), after.stage(seed)
     further = after.further(seed) if left.misfit is None or left.misfit.matters else None
-    added = [p for label in structures.best.labels for p in _added(structures, label, further, seed)]
+    unknown = [label for label in structures.best.labels if structures.search.placed[label].parameters]
+    added = [p for label in unknown for p in _added(structures, label, further, seed)]
     return Discovery(
         name=name,
         columns=tuple(column.sentence for column in structures.columns),

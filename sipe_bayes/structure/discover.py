@@ -184,7 +184,8 @@ def _search(
         simulator.num_threads or cores(),
     )
     most = whole("budget", budget, 1, "rollouts", MOST_ROLLOUTS)
-    return StructureSearch(fitting, extensions, restriction.sites, options, most, progress)
+    finer = restriction.only is None
+    return StructureSearch(fitting, extensions, restriction.sites, options, most, progress, finer)
 
 
 def _check_sites(environment: MjcfEnvironment, sites: Sequence[str] | None) -> None:

@@ -46,6 +46,7 @@ from sipe_bayes.structure.columns import Column, channels_of, choices, is_explai
 from sipe_bayes.structure.extension import Extension, Placed, members, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
 from sipe_bayes.structure.machine import Machine, machine_of
+from sipe_bayes.structure.physics_step import shorter_steps
 from sipe_bayes.structure.rivals import behind, rivals
 from sipe_bayes.structure.state import DiscoverState, Judgement, Offer, Phase
 
@@ -83,6 +84,7 @@ class StructureSearch:
         options: of the search.
         budget: rollouts at most.
         progress: called along the way.
+        finer: whether shorter physics steps are tried beside the extensions.
     """
 
     def __init__(
@@ -93,18 +95,20 @@ class StructureSearch:
         options: DiscoverOptions | None = None,
         budget: int = BUDGET,
         progress: Progress | None = None,
+        finer: bool = False,
     ) -> None:
         self.given = self.fitting = fitting
-        self.extensions, self.joints = tuple(extensions), joints
+        self.extensions, self.joints, self.finer = tuple(extensions), joints, finer
         self.options, self.budget, self.progress = options or DiscoverOptions(), budget, progress
         self._rollouts, self._fit_rollouts, self._doing = 0, 0, ""  # before the present fit, of it, and what it is for
         self._machine: Machine | None = None
         self._placed: dict[str, Placed] = {}
+        self._steps: tuple[str, ...] = ()  # labels of shorter and shorter physics steps, which have no parameters
 
     def step(self, state: DiscoverState) -> DiscoverState:
         """One fit or one ranking further."""
         self.place(state)
-        self._rollouts, self._fit_rollouts, self._doing = state.rollouts, 0, self.describe(state)
+        self._rollouts, self._fit_rollouts, self._doing = state.rollouts, 0, state.describe(len(self._placed))
         self._tell("")
         if state.phase is not Phase.PLAIN and state.rollouts >= self.budget:
             return replace(state, phase=Phase.DONE, cut=state.cut if state.done else state.phase)
@@ -120,21 +124,6 @@ class StructureSearch:
             Phase.DONE: lambda state: state,
         }[state.phase](state)
         return state if state.cut is None else replace(state, phase=Phase.DONE)
-
-    def describe(self, state: DiscoverState) -> str:
-        """What comes next, for the progress bar."""
-        having = f" beside {' and '.join(state.present)}" if state.present else ""
-        return {
-            Phase.PLAIN: "fitting the model as it is",
-            Phase.COLUMNS: "trying signs and units of the logs' columns",
-            Phase.RANK: f"testing {len(self._placed)} extensions{having}",
-            Phase.FIT: f"fitting {state.queue[0] if state.queue else ''}{having}",
-            Phase.AGAIN: f"fitting without {state.larger[-1] if state.larger else ''} once more",
-            Phase.PRUNE: "leaving out each piece once",
-            Phase.SWAP: "trying what promises as much in the place of what is kept",
-            Phase.RESIDUAL: "fitting a force without a name",
-            Phase.DONE: "done",
-        }[state.phase]
 
     def _tell(self, what: str, rollouts: int = 0, _: int = 0) -> None:
         """How far the present step is, after some rollouts of a fit of its own; fewer are those of its next fit."""
@@ -152,12 +141,13 @@ class StructureSearch:
     @cached_property
     def cost(self) -> float:
         """Nats that an extension has to gain because there were so many to choose from."""
-        named = len([p for p in self._placed.values() if not p.extension.last_resort])
+        named = len([p for p in self._placed.values() if p.label not in self._steps and not p.extension.last_resort])
         return math.log(max(named, 1)) + self.options.sparsity
 
     def total(self, one: FittedStructure) -> float:
-        """Log posterior of a structure up to a constant."""
-        return one.evidence - self.cost * len(one.labels)
+        """Log posterior of a structure up to a constant; shorter physics steps, which are never wrong, cost little."""
+        steps = set(self._steps) & set(one.labels)
+        return one.evidence - self.cost * len(set(one.labels) - steps) - self.options.least_gain * len(steps)
 
     def better(self, one: FittedStructure, other: FittedStructure) -> bool:
         """Whether both scores speak for a structure rather than for a smaller one."""
@@ -180,9 +170,11 @@ class StructureSearch:
         plain = state.fitted[0]
         windows = self.fitting.windows(self.fitting.simulator([]))
         self._machine = machine_of(windows, plain.theta, plain.starts)
-        every = (p for e in self.extensions for p in placements(e, self._machine))
+        steps = shorter_steps(self.fitting.environment) if self.finer else []
+        every = (*(p for e in self.extensions for p in placements(e, self._machine)), *steps)
         allowed = None if self.joints is None else set(self.joints)
         self._placed = {p.label: p for p in every if allowed is None or allowed.issuperset(members(p.site))}
+        self._steps = tuple(p.label for p in steps if p.label in self._placed)
 
     def _plain(self, state: DiscoverState) -> DiscoverState:
         """The plain model, where it can be fitted at all."""
@@ -206,7 +198,8 @@ class StructureSearch:
         most = self.budget if plain is None else options.column_share * (self.budget - plain.rollouts)
         while number < len(columns) and spent + options.column_budget <= most:
             column, number = columns[number], number + 1
-            self._doing = f"{self.describe(replace(state, phase=Phase.COLUMNS))}, {number} of {len(columns)}"
+            doing = replace(state, phase=Phase.COLUMNS).describe(len(self._placed))
+            self._doing = f"{doing}, {number} of {len(columns)}"
             one, rollouts = self._try([column], options.column_budget)
             spent += rollouts
             own = channels[column.name, column.command]
@@ -245,6 +238,7 @@ class StructureSearch:
         promising = [c for c in ranked if c.gain > self.cost + self.options.least_gain]
         untried = [c for c in promising if not state.is_tried((*state.present, c.placed.label))]
         queue = tuple(c.placed.label for c in first(untried, self.options.width, self.options.tied))
+        queue = (*self._shorter(state), *queue) if queue else ()  # steps may be all that is about to be named
         return replace(state, queue=queue, phase=Phase.FIT if queue else Phase.PRUNE)
 
     def _ranked(
@@ -257,7 +251,7 @@ class StructureSearch:
         targets = {t for p in own for q in p.parameters for t in q.targets}
         rest = [p for p in self._placed.values() if p.extension.last_resort == last_resort]
         rest = [p for p in rest if not targets & {t for q in p.parameters for t in q.targets}]
-        rest = [p for p in rest if p.label not in here.labels]
+        rest = [p for p in rest if p.label not in (*here.labels, *self._steps)]
         windows.budget, ranked, cut = self._left(state), list[Candidate](), None
         try:
             if rest:
@@ -269,14 +263,20 @@ class StructureSearch:
         done = (*state.ranked, here.labels) if cut is None and not last_resort else state.ranked
         return replace(state, offers=state.offers + offers, ranked=done, rank_rollouts=ranks, cut=cut), ranked
 
+    def _shorter(self, state: DiscoverState) -> list[str]:
+        """The physics steps that come next, where they are not tried yet."""
+        onward = self._steps[len(set(self._steps) & set(state.present)) :][:1]
+        return [label for label in onward if not state.is_tried((*state.present, label))]
+
     def _left(self, state: DiscoverState) -> int:
         """Rollouts of the budget."""
         return max(self.budget - state.rollouts, 0)
 
     def _fit(self, state: DiscoverState) -> DiscoverState:
         label, *rest = state.queue
-        offer = next(o for o in reversed(state.offers) if o.label == label and o.at == state.present)
-        state = self._fitted(state, (*state.present, label), np.concatenate([offer.others, offer.theta]))
+        offers = (o for o in reversed(state.offers) if o.label == label and o.at == state.present)
+        begin = next((np.concatenate([offer.others, offer.theta]) for offer in offers), state.here.theta)
+        state = self._fitted(state, (*state.present, label), begin)
         if state.cut is not None:
             return state
         state = replace(state, queue=tuple(rest))

@@ -113,6 +113,21 @@ class DiscoverState:
         anew = budget > self.budget and (short or bool(self.untried))
         return DiscoverState(budget=budget) if anew else replace(self, budget=budget)
 
+    def describe(self, extensions: int) -> str:
+        """What comes next, for the progress bar; of so many extensions."""
+        having = f" beside {' and '.join(self.present)}" if self.present else ""
+        return {
+            Phase.PLAIN: "fitting the model as it is",
+            Phase.COLUMNS: "trying signs and units of the logs' columns",
+            Phase.RANK: f"testing {extensions} extensions{having}",
+            Phase.FIT: f"fitting {self.queue[0] if self.queue else ''}{having}",
+            Phase.AGAIN: f"fitting without {self.larger[-1] if self.larger else ''} once more",
+            Phase.PRUNE: "leaving out each piece once",
+            Phase.SWAP: "trying what promises as much in the place of what is kept",
+            Phase.RESIDUAL: "fitting a force without a name",
+            Phase.DONE: "done",
+        }[self.phase]
+
     @property
     def done(self) -> bool:
         """Whether the search has ended."""

@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import tomllib
+from functools import partial
 from pathlib import Path
 
 import mujoco
@@ -26,8 +27,10 @@ from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.report.discovery.words import discovery_verdicts
+from sipe_bayes.structure.registry import EXTENSIONS
 from tests.problems.interruptions import stop_in_stage
 from tests.problems.lacking import FRICTION, OWN, write_lacking
+from tests.problems.pendulums import stepped
 
 
 @pytest.fixture(scope="module")
@@ -151,6 +154,22 @@ def test_what_mjcf_has_no_element_for_travels_with_the_model_and_is_said(tmp_pat
     other = written.rollout(written.space.default_theta[None], actions, start, 0.01).observations
     assert np.abs(one).max() > 1
     np.testing.assert_allclose(other, one, atol=1e-3)  # six digits, over five seconds
+
+
+def test_shorter_steps_are_written_into_the_model(tmp_path: Path) -> None:
+    """Of a machine that takes none, and has no more friction than its model."""
+    chosen = ("dry_friction", "spring", "delay")
+    without = json.dumps([name for name in EXTENSIONS if name not in chosen])
+    edits = [partial(stepped, seconds=1e-3)]
+    config = write_lacking(tmp_path, f"[structure]\nwithout = {without}\n", friction=0.0, edits=edits)
+    discovery = run_discovery(config, tmp_path / "out", num_threads=1)
+    (piece,) = discovery.kept
+    assert piece.label == "physics_step:2.5 ms"
+    assert not discovery.added
+    assert discovery_verdicts(discovery)[0].text.startswith("The model lacks physics steps of 2.5 ms, with probability")
+    assert 'timestep="0.0025"' in (tmp_path / "out" / "discovered.xml").read_text(encoding="utf-8")
+    again = run(tmp_path / "out" / "discovered.toml", out=tmp_path / "again", num_threads=1)
+    assert {p.name: p.mode for p in again.parameters} == pytest.approx(dict(discovery.best), rel=1e-3)
 
 
 @pytest.mark.usefixtures("unreported")

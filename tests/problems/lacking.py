@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.envs.mjcf import Edit
 from tests.problems.pendulums import DT, XML, log, pendulum
 
 FRICTION = 0.15
@@ -79,6 +80,8 @@ def write_lacking(
     structure: str = "",
     factors: Mapping[str, float] | None = None,
     target: str = "joint:hinge.frictionloss",
+    friction: float = FRICTION,
+    edits: Sequence[Edit] = (),
 ) -> Path:
     """Model, log and configuration in a folder, and ``own.py``; returns the configuration.
 
@@ -87,9 +90,11 @@ def write_lacking(
         structure: the table of that name in place of the configuration's.
         factors: of columns, of which the configuration says nothing.
         target: that has the friction.
+        friction: in N m.
+        edits: of the machine's own model.
     """
-    truth = pendulum(Parameter("dry", 0.0, 0.5, targets=(target,)))
-    recorded = log(truth, [0.6, 0.05, FRICTION], 3, steps=800, sd=0.005)
+    truth = pendulum(Parameter("dry", 0.0, 0.5, targets=(target,)), edits=edits)
+    recorded = log(truth, [0.6, 0.05, friction], 3, steps=800, sd=0.005)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "pendulum.xml").write_text(XML)
     (folder / "own.py").write_text(OWN)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import mujoco
 import numpy as np
 
 from sipe_bayes.core.parameters import Parameter
@@ -35,6 +36,11 @@ def pendulum(*extra: Parameter, num_threads: int = 1, edits: Sequence[Edit] = ()
     ]
     environment = MjcfEnvironment.build(XML, parameters, ["motor"], ["joint:hinge.position"], edits)
     return Simulator(environment, num_threads=num_threads)
+
+
+def stepped(spec: mujoco.MjSpec, seconds: float) -> None:
+    """An edit: physics steps of so many seconds."""
+    spec.option.timestep = seconds
 
 
 def coloured(rng: np.random.Generator, n: int, sd: float, rho: float) -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 
-import mujoco
 import numpy as np
 import pytest
 import torch
@@ -24,8 +23,10 @@ from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Particles, prior
 from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.structure import Restriction, discover
 from sipe_bayes.structure.physics_step import PHYSICS_STEP, RUNS, step_error
-from tests.problems.pendulums import DT, log, pendulum
+from sipe_bayes.structure.registry import EXTENSIONS
+from tests.problems.pendulums import DT, log, pendulum, stepped
 
 SLIDE = """
 <mujoco>
@@ -86,13 +87,9 @@ def test_a_delay_of_the_models_own_stays_what_it_is() -> None:
         assert (step_error(rows, np.array([0.5]), rows.no_starts()) is not None) == asked
 
 
-def _timestep(spec: mujoco.MjSpec, seconds: float) -> None:
-    spec.option.timestep = seconds
-
-
 def fitted(step: float, seed: int) -> tuple[ProbedLogs, Particles, FloatArray]:
     """A log of a pendulum in steps of so many seconds, fitted by one in steps of 10 ms."""
-    truth, simulator = pendulum(edits=[partial(_timestep, seconds=step)]), pendulum()
+    truth, simulator = pendulum(edits=[partial(stepped, seconds=step)]), pendulum()
     recorded = Trajectories.stack([log(truth, [0.6, 0.08], seed, sd=0.002)])
     method = get_estimator(simulator, "laplace", restarts=1, candidates=0)
     posterior = method.fit(recorded)
@@ -174,3 +171,41 @@ def test_a_step_of_which_the_logs_tell_is_not_untold() -> None:
         (k,) = (k for k, probe in enumerate(logs.probes) if probe.extension is PHYSICS_STEP)
         signs.add(bool(logs.seen.score[k] > 0))
     assert signs == {True, False}
+
+
+AMONG = ("delay", "lag", "sensor_delay", "dry_friction", "spring")
+STEPS = {"physics_step:2.5 ms", "physics_step:0.625 ms"}
+
+
+@pytest.mark.parametrize(
+    ("steps", "planted", "size", "best"),
+    [
+        (0.1, None, 0.0, set()),
+        (1.0, "actuator:motor.delay", 0.03, {"delay:motor"}),
+        (0.1, "actuator:motor.delay", 0.03, {"delay:motor"}),
+        (0.1, "joint:hinge.frictionloss", 0.1, {"dry_friction:hinge"}),
+    ],
+    ids=["steps", "delay", "steps and a delay", "steps and friction"],
+)
+def test_what_steps_do_is_not_named_as_a_piece(steps: float, planted: str | None, size: float, best: set[str]) -> None:
+    """Without shorter steps that compete with them a delay of half a step would explain the first log."""
+    extra = [] if planted is None else [Parameter("planted", 0.0, 0.5, targets=(planted,))]
+    truth = pendulum(*extra, edits=[partial(stepped, seconds=steps * DT)])
+    recorded = log(truth, [0.6, 0.08, size][: len(truth.space)], 5, sd=0.002)
+    without = tuple(name for name in EXTENSIONS if name not in AMONG)
+    structures = discover(pendulum(), Trajectories.stack([recorded]), restriction=Restriction(without=without))
+    print(structures.table())
+    pieces = set(structures.best.labels)
+    assert pieces - STEPS == best
+    assert bool(pieces & STEPS) == (steps < 1.0)
+    for label in best:
+        (value,) = structures.posterior_of_piece(label).values(2000).mean(0)
+        assert value == pytest.approx(size, rel=0.1)
+
+
+def test_steps_are_not_tried_where_the_pieces_are_chosen() -> None:
+    """By name."""
+    recorded = Trajectories.stack([log(pendulum(edits=[partial(stepped, seconds=0.1 * DT)]), [0.6, 0.08], 5, sd=0.002)])
+    chosen = discover(pendulum(), recorded, restriction=Restriction(only=("delay", "spring")))
+    assert "delay:motor" in chosen.best.labels
+    assert not STEPS & set(chosen.search.placed)

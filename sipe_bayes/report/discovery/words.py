@@ -77,8 +77,8 @@ def column_verdict(discovery: Discovery) -> Verdict | None:
 def headline(discovery: Discovery) -> Verdict:
     """What the model lacks, and how much of it."""
     kept = [
-        f"{p.sentence}, {found_values(discovery, p)}, with probability {probability_text(p.probability)}"
-        for p in discovery.kept
+        ", ".join(filter(None, [p.sentence, found_values(discovery, p), f"with probability {likely}"]))
+        for p, likely in ((p, probability_text(p.probability)) for p in discovery.kept)
     ]
     if kept and (cut_short(discovery) or not discovery.settled):
         among = f"Not all of the {len(discovery.rows)} structures were fitted to their end; of these"
