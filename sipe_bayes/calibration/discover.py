@@ -16,7 +16,7 @@ from sipe_bayes.diagnostics.discovery import Discovery
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.structure.discover import Restriction, check_restriction
 from sipe_bayes.structure.discover import discover as search
-from sipe_bayes.structure.search import BUDGET, DiscoverOptions
+from sipe_bayes.structure.state import BUDGET, DiscoverOptions
 from sipe_bayes.structure.structures import Structures
 
 _KEYS = (*(key for key in IDENTITY if key != "budget"), "only", "without", "extensions_sha256")

@@ -49,6 +49,7 @@ _LARGER = 2  # times the budget that did not reach: what to try next
 _BEFORE = {
     Phase.COLUMNS: "any piece was tried",
     Phase.RANK: "what the model may lack was ranked",
+    Phase.STEPS: "shorter physics steps were tried",
     Phase.FIT: "all pieces that promise something were fitted",
     Phase.AGAIN: "the best piece was compared with the model without it",
     Phase.PRUNE: "each kept piece was left out once",
@@ -130,7 +131,7 @@ def _untried(structures: Structures) -> str:
     if state.cut is Phase.FIT:
         names = [search.placed[label].sentence for label in state.queue]
     elif state.cut in (Phase.COLUMNS, Phase.RANK):
-        names = [one.sentence for one in search.placed.values() if one.label not in state.present]
+        names = [p.sentence for p in search.placed.values() if p.parameters and p.label not in state.present]
     else:
         names = []
     if not names:
@@ -262,7 +263,7 @@ def _pieces(structures: Structures) -> tuple[Piece, ...]:
             continue
         evidence, held_out = _gain(structures, label)
         kept = label in structures.best.labels
-        paid = evidence is not None and evidence > structures.search.cost
+        paid = evidence is not None and evidence > structures.search.price(label)
         log_score = _log_score(structures, label)
         against = (held_out is not None and held_out <= 0) or (log_score is not None and log_score < 0)
         pieces.append(

@@ -7,7 +7,7 @@ posterior of the user's parameters averaged over it.
 
 from sipe_bayes.structure.discover import Restriction, discover
 from sipe_bayes.structure.extension import Extension, Placed
-from sipe_bayes.structure.search import DiscoverOptions
+from sipe_bayes.structure.state import DiscoverOptions
 from sipe_bayes.structure.structures import StructureRow, Structures
 
 __all__ = ["DiscoverOptions", "Extension", "Placed", "Restriction", "StructureRow", "Structures", "discover"]

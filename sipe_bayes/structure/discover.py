@@ -23,9 +23,10 @@ from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import placements
 from sipe_bayes.structure.fitted import Fitting
 from sipe_bayes.structure.machine import machine_of
+from sipe_bayes.structure.physics_step import PhysicsStep
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
-from sipe_bayes.structure.search import BUDGET, DiscoverOptions, StructureSearch
-from sipe_bayes.structure.state import DiscoverState
+from sipe_bayes.structure.search import StructureSearch
+from sipe_bayes.structure.state import BUDGET, DiscoverOptions, DiscoverState
 from sipe_bayes.structure.structures import Structures
 
 _SAVE_SECONDS = 1.0
@@ -52,7 +53,7 @@ class Restriction:
 
     def __post_init__(self) -> None:
         for name in self.without:
-            if name not in EXTENSIONS:
+            if name not in (*EXTENSIONS, PhysicsStep.name):
                 hint = nearest_name(name, EXTENSIONS) or f"; known are {', '.join(EXTENSIONS)}"
                 raise ValueError(f"structure.without: no extension {name!r}{hint}")
 
@@ -60,7 +61,13 @@ class Restriction:
     def names(self) -> list[str]:
         """Those that may be tried."""
         chosen = [*(EXTENSIONS if self.only is None else self.only), *self.extra]
-        return [name for name in dict.fromkeys(chosen) if name not in self.without]
+        return [name for name in dict.fromkeys(chosen) if name not in (*self.without, PhysicsStep.name)]
+
+    @property
+    def finer(self) -> bool:
+        """Whether shorter physics steps may be tried."""
+        chosen = self.only is None or PhysicsStep.name in self.only
+        return chosen and PhysicsStep.name not in self.without
 
     @property
     def digests(self) -> dict[str, str]:
@@ -184,8 +191,7 @@ def _search(
         simulator.num_threads or cores(),
     )
     most = whole("budget", budget, 1, "rollouts", MOST_ROLLOUTS)
-    finer = restriction.only is None
-    return StructureSearch(fitting, extensions, restriction.sites, options, most, progress, finer)
+    return StructureSearch(fitting, extensions, restriction.sites, options, most, progress, restriction.finer)
 
 
 def _check_sites(environment: MjcfEnvironment, sites: Sequence[str] | None) -> None:

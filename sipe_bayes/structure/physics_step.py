@@ -9,6 +9,7 @@ of fourth order, twice the change is 15/8 of it.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -28,21 +29,14 @@ RUNS = 2  # rollouts of each log, at most
 
 
 class PhysicsStep(Extension):
-    """A step that is none; nothing that is unknown, so not in the registry.
-
-    Args:
-        timestep: seconds of a shorter one that a model gets; default no step at all.
-    """
+    """A step that is none; nothing that is unknown, so not in the registry."""
 
     name, kind = "physics_step", "world"
     reference = "L. F. Richardson 1911"
 
-    def __init__(self, timestep: float = 0.0) -> None:
-        self.timestep = timestep
-
     def sentence(self, site: str) -> str:
         """In a report."""
-        return f"physics steps of {site}" if self.timestep else "what a shorter physics step would change"
+        return "what a shorter physics step would change"
 
     def off(self, site: str, share: float) -> str:
         """In a report."""
@@ -54,6 +48,38 @@ class PhysicsStep(Extension):
 
 
 PHYSICS_STEP = PhysicsStep()
+
+
+class ShorterSteps(PhysicsStep):
+    """Steps of the size that their site is named by."""
+
+    def sentence(self, site: str) -> str:
+        """In a report."""
+        return f"physics steps of {site}"
+
+
+@dataclass(frozen=True)
+class StepLadder:
+    """Shorter and shorter physics steps, of which a structure has one at most.
+
+    Args:
+        labels: of the pieces, the longest step first.
+    """
+
+    labels: tuple[str, ...] = ()
+
+    def pieces(self, labels: Iterable[str]) -> tuple[str, ...]:
+        """Those that are no steps."""
+        return tuple(label for label in labels if label not in self.labels)
+
+    def rung(self, labels: Sequence[str]) -> int:
+        """How short the steps of a structure are: zero for the model's own."""
+        return max((1 + k for k, label in enumerate(self.labels) if label in labels), default=0)
+
+    def finer(self, labels: Sequence[str]) -> tuple[str, ...] | None:
+        """A structure in the next shorter steps; None where there are none."""
+        onward = self.labels[self.rung(labels) :]
+        return (*self.pieces(labels), onward[0]) if onward else None
 
 
 @dataclass(frozen=True)
@@ -77,19 +103,23 @@ class StepError:
         )
 
 
-def shorter_steps(environment: MjcfEnvironment) -> list[Placed]:
+def shorter_steps(windows: Windows) -> list[Placed]:
     """Pieces of a model that have no parameters: a quarter of its physics step, and a quarter of that.
 
-    Of the error of Euler's steps they leave as much. None where the model does not compile with them.
+    Of the error of Euler's steps they leave as much. None where the model does not compile with them, or no longer has
+    the states that logs recorded.
     """
-    step, pieces = float(environment.compile().opt.timestep), []
+    environment, pieces = windows.simulator.environment, list[Placed]()
+    assert isinstance(environment, MjcfEnvironment)
+    step = float(windows.simulator.model.opt.timestep)
     for shorter in (step / 4, step / 16):
-        edit, site = partial(_stepped, timestep=shorter), f"{1e3 * shorter:g} ms"
-        piece = Placed(PhysicsStep(shorter), site, (), edit, np.zeros((0, 0, 0)))
+        edit, site = partial(_stepped, timestep=shorter), f"{1e3 * shorter:.3g} ms"
+        piece = Placed(ShorterSteps(), site, (), edit, np.zeros((0, 0, 0)))
         try:
-            extended(environment, [piece])
-        except ValueError:  # what the user's MJCF has that depends on the step
-            return []
+            finer = Simulator(extended(environment, [piece]), windows.simulator.num_threads)
+            Windows(windows.settings, finer, windows.trajectories)
+        except ValueError:
+            break
         pieces.append(piece)
     return pieces
 

@@ -30,14 +30,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.options import Options, option
-from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
@@ -46,32 +44,9 @@ from sipe_bayes.structure.columns import Column, channels_of, choices, is_explai
 from sipe_bayes.structure.extension import Extension, Placed, members, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
 from sipe_bayes.structure.machine import Machine, machine_of
-from sipe_bayes.structure.physics_step import shorter_steps
+from sipe_bayes.structure.physics_step import StepLadder, shorter_steps
 from sipe_bayes.structure.rivals import behind, rivals
-from sipe_bayes.structure.state import DiscoverState, Judgement, Offer, Phase
-
-BUDGET = 30_000  # rollouts by default: structures with two pieces of a machine with two joints
-
-
-@dataclass(frozen=True)
-class DiscoverOptions(Options):
-    """How structures are searched."""
-
-    width: int = option(3, "candidates that are fitted in a round; twice as many where they promise the same", least=1)
-    tied: float = option(0.05, "of the best gain, within which candidates promise the same", least=0)
-    most: int = option(5, "extensions that a structure may have", least=1)
-    against: float = option(2.0, "nats of held-out logs that speak against an extension", "nats", least=0)
-    rivals: int = option(3, "of a kept piece that are tried in its place", least=0)
-    rival: float = option(0.1, "of what a kept piece promises in its place, by which a rival may fall behind", least=0)
-    least_gain: float = option(2.0, "promised gain beyond an extension's cost from which it is fitted", "nats", above=0)
-    sparsity: float = option(1.0, "against any extension: a model is expected to lack exp(-1) pieces", "nats", least=0)
-    gross: float = option(THRESHOLDS.gross, "of a channel's spread left from which signs and units are tried", least=0)
-    column_gain: float = option(50.0, "evidence that a sign or unit must gain", "nats", above=0)
-    column_share: float = option(0.2, "of the budget, for signs and units at most", above=0, below=1)
-    column_budget: int = option(400, "rollouts of one fit with another sign or unit", least=1)
-    plain_share: float = option(0.5, "of the budget, for the model as it is at most", above=0, below=1)
-    fit_budget: int = option(2000, "rollouts of one fit, or forty steps of it if that is more", least=1)
-    physics_steps: int = option(10000, "of the logs that are searched on, in blocks spread over longer ones", least=1)
+from sipe_bayes.structure.state import BUDGET, DiscoverOptions, DiscoverState, Judgement, Offer, Phase
 
 
 class StructureSearch:
@@ -103,12 +78,16 @@ class StructureSearch:
         self._rollouts, self._fit_rollouts, self._doing = 0, 0, ""  # before the present fit, of it, and what it is for
         self._machine: Machine | None = None
         self._placed: dict[str, Placed] = {}
-        self._steps: tuple[str, ...] = ()  # labels of shorter and shorter physics steps, which have no parameters
+        self._ladder = StepLadder()
 
     def step(self, state: DiscoverState) -> DiscoverState:
         """One fit or one ranking further."""
         self.place(state)
-        self._rollouts, self._fit_rollouts, self._doing = state.rollouts, 0, state.describe(len(self._placed))
+        self._rollouts, self._fit_rollouts, self._doing = (
+            state.rollouts,
+            0,
+            state.describe(len(self._ladder.pieces(self._placed))),
+        )
         self._tell("")
         if state.phase is not Phase.PLAIN and state.rollouts >= self.budget:
             return replace(state, phase=Phase.DONE, cut=state.cut if state.done else state.phase)
@@ -116,6 +95,7 @@ class StructureSearch:
             Phase.PLAIN: self._plain,
             Phase.COLUMNS: self._columns,
             Phase.RANK: self._rank,
+            Phase.STEPS: self._shorter_steps,
             Phase.FIT: self._fit,
             Phase.AGAIN: self._again,
             Phase.PRUNE: self._prune,
@@ -141,18 +121,28 @@ class StructureSearch:
     @cached_property
     def cost(self) -> float:
         """Nats that an extension has to gain because there were so many to choose from."""
-        named = len([p for p in self._placed.values() if p.label not in self._steps and not p.extension.last_resort])
-        return math.log(max(named, 1)) + self.options.sparsity
+        named = [p for p in self._placed.values() if not p.extension.last_resort]
+        return math.log(max(len(self._ladder.pieces([p.label for p in named])), 1)) + self.options.sparsity
 
     def total(self, one: FittedStructure) -> float:
-        """Log posterior of a structure up to a constant; shorter physics steps, which are never wrong, cost little."""
-        steps = set(self._steps) & set(one.labels)
-        return one.evidence - self.cost * len(set(one.labels) - steps) - self.options.least_gain * len(steps)
+        """Log posterior of a structure up to a constant."""
+        pieces, rung = self._ladder.pieces(one.labels), self._ladder.rung(one.labels)
+        return one.evidence - self.cost * len(pieces) - self.options.step_gain * rung
+
+    def price(self, label: str) -> float:
+        """Nats that a piece has to gain."""
+        return self.options.step_gain * self._ladder.rung([label]) or self.cost
+
+    def foretells(self, one: FittedStructure, other: FittedStructure) -> bool:
+        """Whether held-out pieces speak for a structure rather than a smaller one, or not against finer steps."""
+        if one.held_out is None or other.held_out is None:
+            return True
+        alike = set(self._ladder.pieces(one.labels)) == set(self._ladder.pieces(other.labels))
+        return one.held_out > other.held_out - self.options.against * alike
 
     def better(self, one: FittedStructure, other: FittedStructure) -> bool:
         """Whether both scores speak for a structure rather than for a smaller one."""
-        foretells = one.held_out is None or other.held_out is None or one.held_out > other.held_out
-        return self.total(one) > self.total(other) and foretells
+        return self.total(one) > self.total(other) and self.foretells(one, other)
 
     def enough(self, labels: Sequence[str]) -> int:
         """Rollouts that the fit of a structure may have."""
@@ -170,11 +160,11 @@ class StructureSearch:
         plain = state.fitted[0]
         windows = self.fitting.windows(self.fitting.simulator([]))
         self._machine = machine_of(windows, plain.theta, plain.starts)
-        steps = shorter_steps(self.fitting.environment) if self.finer else []
-        every = (*(p for e in self.extensions for p in placements(e, self._machine)), *steps)
+        every = (p for e in self.extensions for p in placements(e, self._machine))
         allowed = None if self.joints is None else set(self.joints)
         self._placed = {p.label: p for p in every if allowed is None or allowed.issuperset(members(p.site))}
-        self._steps = tuple(p.label for p in steps if p.label in self._placed)
+        steps = {p.label: p for p in shorter_steps(windows)} if self.finer else {}
+        self._ladder, self._placed = StepLadder(tuple(steps)), self._placed | steps
 
     def _plain(self, state: DiscoverState) -> DiscoverState:
         """The plain model, where it can be fitted at all."""
@@ -198,7 +188,7 @@ class StructureSearch:
         most = self.budget if plain is None else options.column_share * (self.budget - plain.rollouts)
         while number < len(columns) and spent + options.column_budget <= most:
             column, number = columns[number], number + 1
-            doing = replace(state, phase=Phase.COLUMNS).describe(len(self._placed))
+            doing = replace(state, phase=Phase.COLUMNS).describe(0)
             self._doing = f"{doing}, {number} of {len(columns)}"
             one, rollouts = self._try([column], options.column_budget)
             spent += rollouts
@@ -230,7 +220,7 @@ class StructureSearch:
         return one, one.rollouts
 
     def _rank(self, state: DiscoverState) -> DiscoverState:
-        if len(state.present) >= self.options.most:
+        if len(self._ladder.pieces(state.present)) >= self.options.most:
             return replace(state, phase=Phase.PRUNE)
         state, ranked = self._ranked(state, state.here, last_resort=False)
         if state.cut is not None:
@@ -238,8 +228,18 @@ class StructureSearch:
         promising = [c for c in ranked if c.gain > self.cost + self.options.least_gain]
         untried = [c for c in promising if not state.is_tried((*state.present, c.placed.label))]
         queue = tuple(c.placed.label for c in first(untried, self.options.width, self.options.tied))
-        queue = (*self._shorter(state), *queue) if queue else ()  # steps may be all that is about to be named
-        return replace(state, queue=queue, phase=Phase.FIT if queue else Phase.PRUNE)
+        return replace(state, queue=queue, phase=Phase.STEPS if queue else Phase.PRUNE)
+
+    def _shorter_steps(self, state: DiscoverState) -> DiscoverState:
+        """The present structure in shorter physics steps: what is about to be named may be nothing but what they do."""
+        labels = self._ladder.finer(state.present)
+        if labels is None or state.is_tried(labels):
+            return replace(state, phase=Phase.FIT)
+        fitted = self._fitted(state, labels, state.here.theta)
+        one = fitted.of(labels)
+        if one is None or not self.better(one, state.here):
+            return replace(fitted, phase=Phase.FIT)
+        return replace(fitted, present=labels, queue=(), phase=Phase.RANK)
 
     def _ranked(
         self, state: DiscoverState, here: FittedStructure, last_resort: bool
@@ -251,7 +251,7 @@ class StructureSearch:
         targets = {t for p in own for q in p.parameters for t in q.targets}
         rest = [p for p in self._placed.values() if p.extension.last_resort == last_resort]
         rest = [p for p in rest if not targets & {t for q in p.parameters for t in q.targets}]
-        rest = [p for p in rest if p.label not in (*here.labels, *self._steps)]
+        rest = [p for p in rest if p.parameters and p.label not in here.labels]
         windows.budget, ranked, cut = self._left(state), list[Candidate](), None
         try:
             if rest:
@@ -263,20 +263,14 @@ class StructureSearch:
         done = (*state.ranked, here.labels) if cut is None and not last_resort else state.ranked
         return replace(state, offers=state.offers + offers, ranked=done, rank_rollouts=ranks, cut=cut), ranked
 
-    def _shorter(self, state: DiscoverState) -> list[str]:
-        """The physics steps that come next, where they are not tried yet."""
-        onward = self._steps[len(set(self._steps) & set(state.present)) :][:1]
-        return [label for label in onward if not state.is_tried((*state.present, label))]
-
     def _left(self, state: DiscoverState) -> int:
         """Rollouts of the budget."""
         return max(self.budget - state.rollouts, 0)
 
     def _fit(self, state: DiscoverState) -> DiscoverState:
         label, *rest = state.queue
-        offers = (o for o in reversed(state.offers) if o.label == label and o.at == state.present)
-        begin = next((np.concatenate([offer.others, offer.theta]) for offer in offers), state.here.theta)
-        state = self._fitted(state, (*state.present, label), begin)
+        offer = next(o for o in reversed(state.offers) if o.label == label and o.at == state.present)
+        state = self._fitted(state, (*state.present, label), np.concatenate([offer.others, offer.theta]))
         if state.cut is not None:
             return state
         state = replace(state, queue=tuple(rest))
@@ -348,7 +342,7 @@ class StructureSearch:
     def _swap(self, state: DiscoverState) -> DiscoverState:
         """What is left without one kept piece ranked, one structure with a rival fitted, or all of them compared."""
         here, options = state.here, self.options
-        for kept in here.labels if options.rivals else ():
+        for kept in self._ladder.pieces(here.labels) if options.rivals else ():
             without = state.of([label for label in here.labels if label != kept])
             if without is None:
                 continue
@@ -384,9 +378,10 @@ class StructureSearch:
         return own + [label for label in one.labels for _ in self._placed[label].parameters]
 
     def _fitted(self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray) -> DiscoverState:
-        most, left = self.enough(labels), self._left(state)
-        cut = state.phase if left < most else None
+        left, cut = self._left(state), None
         try:
+            most = self.enough(labels)
+            cut = state.phase if left < most else None
             one = self.fitting.fit(self.structure(labels), initial, max(min(most, left), 1), self._tell)
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
             spent = state.failed_rollouts + self._fit_rollouts

@@ -1,4 +1,4 @@
-"""Where a search over structures stands: what was fitted, what was promised, what comes next."""
+"""How structures are searched, and where a search stands: what was fitted, what was promised, what comes next."""
 
 from __future__ import annotations
 
@@ -7,8 +7,34 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.options import Options, option
+from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.structure.columns import Column
 from sipe_bayes.structure.fitted import FittedStructure
+
+BUDGET = 30_000  # rollouts by default: structures with two pieces of a machine with two joints
+
+
+@dataclass(frozen=True)
+class DiscoverOptions(Options):
+    """How structures are searched."""
+
+    width: int = option(3, "candidates that are fitted in a round; twice as many where they promise the same", least=1)
+    tied: float = option(0.05, "of the best gain, within which candidates promise the same", least=0)
+    most: int = option(5, "extensions that a structure may have", least=1)
+    against: float = option(2.0, "nats of held-out logs that speak against an extension", "nats", least=0)
+    rivals: int = option(3, "of a kept piece that are tried in its place", least=0)
+    rival: float = option(0.1, "of what a kept piece promises in its place, by which a rival may fall behind", least=0)
+    step_gain: float = option(2.0, "evidence that shorter physics steps must gain", "nats", least=0)
+    least_gain: float = option(2.0, "promised gain beyond an extension's cost from which it is fitted", "nats", above=0)
+    sparsity: float = option(1.0, "against any extension: a model is expected to lack exp(-1) pieces", "nats", least=0)
+    gross: float = option(THRESHOLDS.gross, "of a channel's spread left from which signs and units are tried", least=0)
+    column_gain: float = option(50.0, "evidence that a sign or unit must gain", "nats", above=0)
+    column_share: float = option(0.2, "of the budget, for signs and units at most", above=0, below=1)
+    column_budget: int = option(400, "rollouts of one fit with another sign or unit", least=1)
+    plain_share: float = option(0.5, "of the budget, for the model as it is at most", above=0, below=1)
+    fit_budget: int = option(2000, "rollouts of one fit, or forty steps of it if that is more", least=1)
+    physics_steps: int = option(10000, "of the logs that are searched on, in blocks spread over longer ones", least=1)
 
 
 class Phase(enum.Enum):
@@ -17,6 +43,7 @@ class Phase(enum.Enum):
     PLAIN = "plain"
     COLUMNS = "columns"
     RANK = "rank"
+    STEPS = "steps"
     FIT = "fit"
     AGAIN = "again"
     PRUNE = "prune"
@@ -120,6 +147,7 @@ class DiscoverState:
             Phase.PLAIN: "fitting the model as it is",
             Phase.COLUMNS: "trying signs and units of the logs' columns",
             Phase.RANK: f"testing {extensions} extensions{having}",
+            Phase.STEPS: f"fitting shorter physics steps{having}",
             Phase.FIT: f"fitting {self.queue[0] if self.queue else ''}{having}",
             Phase.AGAIN: f"fitting without {self.larger[-1] if self.larger else ''} once more",
             Phase.PRUNE: "leaving out each piece once",

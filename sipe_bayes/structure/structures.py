@@ -93,7 +93,7 @@ class Structures:
         if self._is_yardstick(one) or self.state.is_refused(one.labels) or cut_off:
             return False
         smaller = [o for o in self.fitted if set(o.labels) < set(one.labels)]
-        return all(one.held_out is None or o.held_out is None or one.held_out > o.held_out for o in smaller)
+        return all(self.search.foretells(one, other) for other in smaller)
 
     def _is_yardstick(self, one: FittedStructure) -> bool:
         return any(self.search.placed[label].extension.last_resort for label in one.labels)

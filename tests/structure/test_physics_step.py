@@ -23,8 +23,8 @@ from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Particles, prior
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure import Restriction, discover
-from sipe_bayes.structure.physics_step import PHYSICS_STEP, RUNS, step_error
+from sipe_bayes.structure import Restriction, Structures, discover
+from sipe_bayes.structure.physics_step import PHYSICS_STEP, RUNS, StepLadder, step_error
 from sipe_bayes.structure.registry import EXTENSIONS
 from tests.problems.pendulums import DT, log, pendulum, stepped
 
@@ -174,7 +174,14 @@ def test_a_step_of_which_the_logs_tell_is_not_untold() -> None:
 
 
 AMONG = ("delay", "lag", "sensor_delay", "dry_friction", "spring")
+FRICTION = Parameter("planted", 0.0, 0.5, targets=("joint:hinge.frictionloss",))
 STEPS = {"physics_step:2.5 ms", "physics_step:0.625 ms"}
+
+
+def among(recorded: Trajectory) -> Structures:
+    """Searched among a few extensions."""
+    without = tuple(name for name in EXTENSIONS if name not in AMONG)
+    return discover(pendulum(), Trajectories.stack([recorded]), restriction=Restriction(without=without))
 
 
 @pytest.mark.parametrize(
@@ -192,8 +199,7 @@ def test_what_steps_do_is_not_named_as_a_piece(steps: float, planted: str | None
     extra = [] if planted is None else [Parameter("planted", 0.0, 0.5, targets=(planted,))]
     truth = pendulum(*extra, edits=[partial(stepped, seconds=steps * DT)])
     recorded = log(truth, [0.6, 0.08, size][: len(truth.space)], 5, sd=0.002)
-    without = tuple(name for name in EXTENSIONS if name not in AMONG)
-    structures = discover(pendulum(), Trajectories.stack([recorded]), restriction=Restriction(without=without))
+    structures = among(recorded)
     print(structures.table())
     pieces = set(structures.best.labels)
     assert pieces - STEPS == best
@@ -203,9 +209,53 @@ def test_what_steps_do_is_not_named_as_a_piece(steps: float, planted: str | None
         assert value == pytest.approx(size, rel=0.1)
 
 
-def test_steps_are_not_tried_where_the_pieces_are_chosen() -> None:
-    """By name."""
-    recorded = Trajectories.stack([log(pendulum(edits=[partial(stepped, seconds=0.1 * DT)]), [0.6, 0.08], 5, sd=0.002)])
-    chosen = discover(pendulum(), recorded, restriction=Restriction(only=("delay", "spring")))
-    assert "delay:motor" in chosen.best.labels
-    assert not STEPS & set(chosen.search.placed)
+def placed(restriction: Restriction, simulator: Simulator, states: bool = False) -> set[str]:
+    """Labels of all that a search may try; states: whether windows begin at the log's own."""
+    theta = simulator.space.normalise(np.array([0.6, 0.08, 0.02][: len(simulator.space)]))
+    recorded = log(simulator, simulator.space.values(theta).tolist(), 3)
+    motion = simulator.rollout(theta, recorded.actions, simulator.default_state(), dt=DT)
+    assert motion.states is not None
+    logs = Trajectories.stack([Trajectory(recorded.observations, recorded.actions, DT, motion.states[0], "known")])
+    likelihood = Segments(None, starts="recorded" if states else "estimated")
+    return set(discover(simulator, logs, likelihood=likelihood, restriction=restriction, budget=400).search.placed)
+
+
+@pytest.mark.parametrize(
+    ("restriction", "tried"),
+    [
+        (Restriction(sites=("hinge",)), True),
+        (Restriction(only=("delay", "physics_step")), True),
+        (Restriction(only=("delay", "spring")), False),
+        (Restriction(without=("physics_step",)), False),
+    ],
+    ids=["sites", "chosen", "others", "without"],
+)
+def test_steps_are_tried_unless_other_pieces_are_chosen_or_they_are_left_out(
+    restriction: Restriction, tried: bool
+) -> None:
+    assert STEPS & placed(restriction, pendulum()) == (STEPS if tried else set())
+
+
+def test_steps_that_the_logs_do_not_go_with_are_not_tried() -> None:
+    """Recorded states with a history of commands, which shorter steps make longer."""
+    delay, few = Parameter("delay", 0.0, 0.1, targets=("actuator:motor.delay",)), Restriction(only=("physics_step",))
+    assert not placed(few, pendulum(delay), states=True)
+    assert placed(few, pendulum(), states=True) == STEPS
+
+
+def test_finer_steps_are_not_refused_by_a_tie_of_held_out_pieces() -> None:
+    """Of a quarter of a quarter, as a sensor that is late by half a step would explain the rest of a rough log."""
+    truth = pendulum(FRICTION, edits=[partial(stepped, seconds=1e-3)])
+    structures = among(log(truth, [0.6, 0.08, 0.03], 2, sd=0.002))
+    print(structures.table())
+    assert set(structures.best.labels) == {"dry_friction:hinge", "physics_step:0.625 ms"}
+    assert structures.inclusion().get("physics_step:2.5 ms", 0.0) < 0.1
+
+
+def test_a_structure_has_one_step_at_most() -> None:
+    ladder = StepLadder(("a", "b"))
+    assert ladder.finer(()) == ("a",)
+    assert ladder.finer(("friction", "a", "delay")) == ("friction", "delay", "b")
+    assert ladder.finer(("b", "friction")) is None
+    assert [ladder.rung(labels) for labels in ((), ("a",), ("friction", "b"))] == [0, 1, 2]
+    assert ladder.pieces(("friction", "b", "delay")) == ("friction", "delay")
