@@ -228,13 +228,16 @@ class StructureSearch:
         promising = [c for c in ranked if c.gain > self.cost + self.options.least_gain]
         untried = [c for c in promising if not state.is_tried((*state.present, c.placed.label))]
         queue = tuple(c.placed.label for c in first(untried, self.options.width, self.options.tied))
-        return replace(state, queue=queue, phase=Phase.STEPS if queue else Phase.PRUNE)
+        if not queue:
+            return replace(state, phase=Phase.PRUNE)
+        finer = self._ladder.finer(state.present)
+        tried = finer is None or state.is_tried(finer)
+        return replace(state, queue=queue, phase=Phase.FIT if tried else Phase.STEPS)
 
     def _shorter_steps(self, state: DiscoverState) -> DiscoverState:
         """The present structure in shorter physics steps: what is about to be named may be nothing but what they do."""
         labels = self._ladder.finer(state.present)
-        if labels is None or state.is_tried(labels):
-            return replace(state, phase=Phase.FIT)
+        assert labels is not None
         fitted = self._fitted(state, labels, state.here.theta)
         one = fitted.of(labels)
         if one is None or not self.better(one, state.here):
