@@ -96,7 +96,7 @@ def measured(name: str, worlds: int, steps: int, device: str) -> dict[str, Any]:
         "of_which_writing": round(writing / ours, 3),
         "bare_steps_per_s": round(physics / alone),
         "share_of_bare": round(alone / ours, 3),
-        "share_of_bare_without_writing": round(alone / (ours - writing), 3),
+        "share_of_bare_without_writing": round(alone / max(ours - writing, 1e-9), 3),
         "processor_steps_per_s": round(own),
         "processor_threads": processor.num_threads,
         "gain": round(physics / ours / own, 2),

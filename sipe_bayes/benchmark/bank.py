@@ -2,8 +2,8 @@
 
 A bank is a folder of ``inference.amortised.simulations.Cache``: its name is a hash of model, parameters, prior, seed,
 actions and starts, and row i follows from the seed and i alone. So shards made on different machines are the parts of
-one bank: merging is copying their files into one folder, and a lost file is made again bit for bit. ``shard-*.json``
-beside the blocks says what a shard cost.
+one bank: merging is copying their files into one folder, and a lost file is made again bit for bit (on a card but
+for what docs/gpu.md says). ``shard-*.json`` beside the blocks says what a shard cost.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Training DDPG on the batched engine: interruptible, resumable bit for bit, every number on disk.
+"""Training DDPG on the batched engine: interruptible, resumable bit for bit (not on a card), every number on disk.
 
 A policy is kept at every evaluation. ``suboptimal.safetensors`` is the one kept first at or after half of the steps;
 ``expert.safetensors`` the one of the highest mean return among those after it, since DDPG does not end on its best. It
