@@ -10,7 +10,7 @@ from sipe_bayes.calibration.checks.clipping import SATURATION, Signal, clipped_o
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_tables import LogEntry, Measurement
 from sipe_bayes.calibration.grid import Grid, Recording, Series, gaps
-from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectory
@@ -18,6 +18,7 @@ from sipe_bayes.diagnostics.records import LogReport
 from sipe_bayes.likelihood.wild_samples import jumps
 
 _EVEN, _FEWEST = 0.95, 10  # share of a slower sensor's samples that are as far apart as usual; and how many it has
+_AFTER = 5.0  # samples after a jump of a command, in which a fast joint may follow it
 _SILENT = 10.0  # periods of a command after its last one: a stream that has stopped, and no late message
 
 
@@ -101,6 +102,7 @@ def _of_clocks(config: Config, log: LogEntry, raw: Recording) -> list[Finding]:
     for (m, _), y in zip(config.sources, raw.measurements, strict=True):
         known = np.flatnonzero(np.isfinite(y.values))
         places = jumps(y.values[known]) if _of_joint(m) and m.target.endswith(".position") else known[:0]
+        places = places[~_commanded(raw, y.time[known], places)]
         if len(places):
             when = float(y.time[known[places[0] + 1]] - raw.time[0])
             noticed.append(finding(Code.LOG_JUMPS, log=log.name, channel=m.name, count=len(places), when=when))
@@ -111,6 +113,15 @@ def _of_clocks(config: Config, log: LogEntry, raw: Recording) -> list[Finding]:
         rate = f"{min(slow.values()):.3g} Hz"
         noticed.append(finding(Code.LOG_SLOW, log=log.name, channels=", ".join(slow), rate=rate))
     return noticed
+
+
+def _commanded(raw: Recording, times: FloatArray, places: IntArray) -> BoolArray:
+    """Which of the steps from samples ``places`` (k,) on, at times (n,), come right after a jump of a command."""
+    if not len(places):
+        return np.zeros(0, bool)
+    jumped = [y.time[1 + jumps(y.values)] for y in raw.commands if np.isfinite(y.values).all()]
+    ago = times[places + 1, None] - np.concatenate([*jumped, np.full(1, np.inf)])
+    return np.asarray(((ago >= 0) & (ago <= _AFTER * float(np.median(np.diff(times))))).any(axis=1))
 
 
 def _every(known: BoolArray) -> int:

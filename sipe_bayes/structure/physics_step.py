@@ -99,7 +99,8 @@ class StepError:
         """For a report."""
         half = 0.5 * self.timestep
         return (
-            f'write <option timestep="{half:g}"/> into the model, or use it at no other step than {self.timestep:g} s'
+            f'write <option timestep="{half:g}"/> into the model, and shorter ones until values stay what they are; or '
+            f"use it at no other step than {self.timestep:g} s"
         )
 
 

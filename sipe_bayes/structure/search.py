@@ -9,6 +9,8 @@ r"""The search over structures: what promises most is fitted, the best is kept, 
     RANK    score tests of all extensions at the present structure (``candidates``)
       |  something promises more than it costs          nothing does
       v                                                      v
+    STEPS   shorter physics steps; if better, RANK            |
+      v                                                      v
     FIT     the best few, one a step ------------------>  PRUNE   each kept piece left out once
       |  the best of them is better                           v
       v                                                    SWAP   what promises as much, in a kept one's place
@@ -21,9 +23,9 @@ r"""The search over structures: what promises most is fitted, the best is kept, 
 
 .. math:: \log p(S \mid y) = \log p(y \mid S) - K (\log n + c) + const,
 
-and it counts only where the log score of held-out pieces has become better with it as well, and where the logs that no
-fit has seen do not speak against it. Structures that are about equally good are not decided between:
-``Structures.posterior`` averages over them.
+shorter physics steps paying ``step_gain``, and it counts only where the log score of held-out pieces has become better
+with it as well, and where the logs that no fit has seen do not speak against it. Structures that are about equally good
+are not decided between: ``Structures.posterior`` averages over them.
 """
 
 from __future__ import annotations
@@ -83,11 +85,8 @@ class StructureSearch:
     def step(self, state: DiscoverState) -> DiscoverState:
         """One fit or one ranking further."""
         self.place(state)
-        self._rollouts, self._fit_rollouts, self._doing = (
-            state.rollouts,
-            0,
-            state.describe(len(self._ladder.pieces(self._placed))),
-        )
+        self._rollouts, self._fit_rollouts = state.rollouts, 0
+        self._doing = state.describe(len(self._ladder.pieces(self._placed)))
         self._tell("")
         if state.phase is not Phase.PLAIN and state.rollouts >= self.budget:
             return replace(state, phase=Phase.DONE, cut=state.cut if state.done else state.phase)

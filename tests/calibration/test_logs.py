@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+import sipe_bayes as sipe
 from sipe_bayes.calibration.checks.clipping import count_clipped
 from sipe_bayes.calibration.checks.fitted import with_wild
 from sipe_bayes.calibration.config import load_config
@@ -20,8 +21,10 @@ from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.calibration.readers.base import LogError
 from sipe_bayes.calibration.readers.tables import read_table
+from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
+from tests.problems.lacking import write_lacking
 from tests.problems.log_tables import EXAMPLES, FAST, QUIET, TOML, configure, load, regular, write
 
 finite = st.floats(-1e6, 1e6, allow_subnormal=False)
@@ -322,3 +325,18 @@ def test_samples_that_the_fit_left_out_are_counted_with_them(monkeypatch: pytest
     monkeypatch.setattr(Laplace, "wild", np.array([[0, 5, 0], [0, 6, 0], [0, 7, 0]]))
     (counted,) = with_wild(cast(Problem, problem), Laplace.__new__(Laplace))
     assert counted.wild == {"q": 5}
+
+
+@pytest.mark.parametrize(("late", "warned"), [(2, False), (None, True), (40, True)], ids=["follows", "alone", "later"])
+def test_a_joint_that_follows_a_jump_of_its_command_has_not_jumped(
+    late: int | None, warned: bool, tmp_path: Path
+) -> None:
+    config = write_lacking(tmp_path)
+    table = pd.read_csv(tmp_path / "log.csv")
+    table["torque"], table["angle"] = 0.1, 0.1 * np.sin(6 * table["time"])
+    table.loc[200:, "angle"] += 0.5
+    if late is not None:
+        table.loc[200 - late :, "torque"] = 0.6
+    table.to_csv(tmp_path / "log.csv", index=False)
+    codes = {one.code for report in sipe.prepare(config, 1).reports for one in report.findings}
+    assert (Code.LOG_JUMPS in codes) == warned
