@@ -239,8 +239,7 @@ def lack(calibration: Calibration) -> Verdict | None:
     misfit = calibration.misfit
     if misfit is None or not misfit.alarm:
         return None
-    channel = max(misfit.share, key=lambda name: misfit.share[name])
-    share = f"{number(100 * misfit.share[channel], 2)} % of the residual of {channel}"
+    share = f"{number(100 * misfit.share[misfit.channel], 2)} % of the residual of {misfit.channel}"
     if not misfit.matters:
         return Verdict("fair", f"The model lacks something small: it looks like {misfit.cause} ({share}).")
     text = f"The model lacks something: it looks like {misfit.cause} ({share}, {misfit.p_text})."

@@ -164,6 +164,8 @@ def test_what_the_model_lacks_is_among_the_first_sentences(calibration: Calibrat
     assert found is not None
     assert found.tone == "bad"
     assert "drag at hinge (40 % of the residual of angle_0, p = 0.005)" in found.text
+    both = dataclasses.replace(LACKS, share={**LACKS.share, "angle_1": 0.9})  # the warning names the same channel
+    assert judged.lack(dataclasses.replace(calibration, misfit=both)) == found
     small = judged.lack(
         dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, share={"angle_0": 0.04}, shift={}))
     )
