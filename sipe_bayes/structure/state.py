@@ -26,6 +26,7 @@ class DiscoverOptions(Options):
     rivals: int = option(3, "of a kept piece that are tried in its place", least=0)
     rival: float = option(0.1, "of what a kept piece promises in its place, by which a rival may fall behind", least=0)
     step_gain: float = option(2.0, "evidence that shorter physics steps must gain", "nats", least=0)
+    step_share: float = option(0.5, "of the best promise, that they must gain to be gone on from", least=0)
     least_gain: float = option(2.0, "promised gain beyond an extension's cost from which it is fitted", "nats", above=0)
     sparsity: float = option(1.0, "against any extension: a model is expected to lack exp(-1) pieces", "nats", least=0)
     gross: float = option(THRESHOLDS.gross, "of a channel's spread left from which signs and units are tried", least=0)
