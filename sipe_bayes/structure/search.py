@@ -240,7 +240,7 @@ class StructureSearch:
         fitted = self._fitted(state, labels, state.here.theta)
         one = fitted.of(labels)
         least = self.options.step_share
-        promised = max(o.gain for o in state.offers if o.at == state.present and o.label in state.queue)
+        promised = max((o.gain for o in state.offers if o.at == state.present and o.label in state.queue), default=0.0)
         if one is None or not self.better(one, state.here) or one.evidence - state.here.evidence < least * promised:
             return replace(fitted, phase=Phase.FIT)
         return replace(fitted, present=labels, queue=(), phase=Phase.RANK)
