@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,16 +16,18 @@ if TYPE_CHECKING:
     from sipe_bayes.diagnostics.discovery import Discovery
     from sipe_bayes.inference.recorded import Progress
 
+_RECENT = 60.0  # s, over which the pace is taken at least
 _WIDTH = 58  # of what a structure has
 _TRIED, _ERRORS, _VALUES = 5, 2, 3  # lines of each kind that are printed: twenty in all
 _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 
 
 class Paced:
-    """Progress that says how far a search is and about how long the rest of its budget takes, at the pace until now.
+    """Progress that says how far a search is and about how long the rest of its budget takes, at the latest pace.
 
-    That is an estimate and no bound: structures with more pieces simulate and are checked more slowly, and what comes
-    after the search, comparing before and after, is not in it.
+    That is an estimate and no bound: structures with more pieces or shorter physics steps simulate and are checked more
+    slowly, and what comes after the search, comparing before and after, is not in it. The pace is that of the last
+    third of the time, a minute of it at least.
 
     Args:
         shown: called with what is being done, in which that stands.
@@ -32,12 +35,18 @@ class Paced:
 
     def __init__(self, shown: Progress) -> None:
         self._shown = shown
-        self._first: tuple[int, float] | None = None  # rollouts that an earlier run had done, and when this one began
+        self._passed: deque[tuple[int, float]] = deque()  # how much was done, and when, since where the pace begins
+        self._began = 0.0
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Say what is being done, and how much of all is done."""
         now = time.monotonic()
-        before, began = self._first = self._first or (done, now)
+        self._began = self._began if self._passed else now
+        self._passed.append((done, now))
+        since = now - max(_RECENT, (now - self._began) / 3)
+        while len(self._passed) > 2 and self._passed[1][1] <= since:
+            self._passed.popleft()
+        before, began = self._passed[0]
         if done < total:
             what += f"; {done} of {total} rollouts"
             if done > before:

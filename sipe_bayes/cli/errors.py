@@ -33,7 +33,7 @@ def exit_on_error(then: str = "") -> Iterator[None]:
     """Input errors are one line on standard error and exit code 2.
 
     Args:
-        then: what is said to do after an interruption.
+        then: what is said to do after an interruption, behind what the interruption itself says there is.
 
     Raises:
         typer.Exit: in place of the error.
@@ -53,8 +53,9 @@ def exit_on_error(then: str = "") -> Iterator[None]:
     except MemoryError:
         print("sipe: more memory is asked for than there is; ask for less, or use a larger machine", file=sys.stderr)
         raise typer.Exit(BAD_INPUT) from None
-    except KeyboardInterrupt:
-        say_interrupted(then)
+    except KeyboardInterrupt as interruption:
+        so_far = str(interruption)
+        say_interrupted(f": {so_far}{then}" if so_far else then)
         raise typer.Exit(INTERRUPTED) from None
 
 

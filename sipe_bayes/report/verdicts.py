@@ -94,7 +94,7 @@ def _with_what_is_lacking(parameter: ParameterSummary, findings: Findings) -> Ve
     if _wide(parameter):
         return Verdict("bad", "not determined")
     if _doubts(findings, [parameter]):
-        return Verdict("fair", "determined by the wider interval; doubted above")  # no interval is to be used yet
+        return Verdict("fair", "doubted above, not to be used yet")
     return Verdict("fair", "within the wider interval")
 
 

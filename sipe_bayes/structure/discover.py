@@ -109,6 +109,7 @@ def discover(
     Raises:
         ValueError: for a simulator of anything but an MJCF, unknown extensions, or sites that the model does not have.
         CheckpointError: for a checkpoint that is damaged or of another run.
+        KeyboardInterrupt: with what the search has, in words.
     """
     given = simulator, trajectories, holdout, prior, likelihood, restriction, options, budget, seed, progress
     search = _search(*given)
@@ -119,7 +120,11 @@ def discover(
         state = load_state(checkpoint, DiscoverState, fingerprint).with_budget(search.budget, enough)
     saved = -_SAVE_SECONDS
     while not state.done:
-        before, state = state, search.step(state)
+        before = state
+        try:
+            state = search.step(state)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(state.so_far) from None  # who is told need not wait for the end
         if checkpoint is not None and (state.done or time.monotonic() - saved > _SAVE_SECONDS):
             save_state(checkpoint, before if state.cut else state, fingerprint)  # a larger budget takes that step anew
             saved = time.monotonic()

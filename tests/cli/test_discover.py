@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -55,14 +56,45 @@ def test_calibrates_and_then_discovers(
 
 def test_what_the_rest_takes_is_an_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
     """At the pace of this run, with all that it did beside rollouts; an earlier run's count for nothing."""
-    clock, shown = iter([100.0, 110.0, 140.0, 150.0]), list[str]()
-    monkeypatch.setattr("sipe_bayes.cli.discover.time", SimpleNamespace(monotonic=lambda: next(clock)))
-    paced = Paced(lambda what, _, __: shown.append(what))
-    for done in (1000, 1000, 1200, 2000):
-        paced("fitting", done, 2000)
+    shown = paced(monkeypatch, (1000, 100.0), (1000, 110.0), (1200, 140.0), (2000, 150.0))
     assert shown == [
         "fitting; 1000 of 2000 rollouts",
         "fitting; 1000 of 2000 rollouts",
         "fitting; 1200 of 2000 rollouts, about 3 min if all are needed",
         "fitting",
     ]
+
+
+def test_the_pace_is_the_latest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorter physics steps take sixteen times as long; what was done before says nothing of the rest."""
+    shown = paced(monkeypatch, *((10 * k, 10.0 * k) for k in range(1, 7)), *((60 + k, 60 + 20.0 * k) for k in range(15)))
+    assert "60 of 100 rollouts, about 40 s" in shown[5]
+    assert "74 of 100 rollouts, about 9 min" in shown[-1]  # 26 rollouts of 20 s
+
+
+def paced(monkeypatch: pytest.MonkeyPatch, *done: tuple[int, float]) -> list[str]:
+    """What is shown of rollouts and when they were done, of as many as the next hundred or thousand."""
+    clock, shown = iter([seconds for _, seconds in done]), list[str]()
+    monkeypatch.setattr("sipe_bayes.cli.discover.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    says = Paced(lambda what, _, __: shown.append(what))
+    for count, _ in done:
+        says("fitting", count, 2000 if count > 100 else 100)
+    return shown
+
+
+def test_an_interruption_says_what_there_is(
+    config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Which is gone on from: dry friction is fitted and kept before the others are asked once more."""
+    monkeypatch.setattr("sys.argv", ["sipe", "discover", str(config), "--threads", "1", "--out", str(config.parent / "o")])
+    monkeypatch.setattr("sipe_bayes.structure.search.StructureSearch._swap", _interrupted)
+    with pytest.raises(SystemExit) as left:
+        main()
+    assert left.value.code == 130
+    said = capsys.readouterr().err
+    assert re.search(r"sipe: interrupted: \d+ structures fitted, kept so far dry_friction:hinge, \d\d+ nats", said)
+    assert said.rstrip().endswith("over the model as it was; the same command goes on")
+
+
+def _interrupted(*_: object) -> None:
+    raise KeyboardInterrupt

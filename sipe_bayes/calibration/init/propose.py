@@ -361,7 +361,8 @@ def _unknowns(
         for reading, channels in zip(draft.measurements, layout.channels, strict=False)
         for k in channels if k in lost
     ]  # fmt: skip
-    return [*late, *shown], samples, notes, [*doubts, *sprung(unknowns, beside, left)]
+    asked, pulls = sprung(model, unknowns, beside, left, np.concatenate(passed))
+    return [*late, *shown, *asked], samples, notes, [*doubts, *pulls]
 
 
 def _some(unknowns: list[Unknown]) -> tuple[list[Unknown], list[str]]:

@@ -67,8 +67,10 @@ def test_a_spring_that_the_model_lacks_hides_no_delay(kind: str, variant: int, s
     truth = make_log(tmp_path, KINDS[kind], variant, 100 + variant, spring)
     draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
     assert round(draft.delay) == truth.delay > 1
-    lines = [doubt for doubt in draft.doubts if "a spring" in doubt]
-    assert [f"joint:{KINDS[kind].joints[0]}" in line for line in lines] == [True] * (spring > 0)
+    joint = f"joint:{KINDS[kind].joints[0]}"
+    assert [joint in doubt for doubt in draft.doubts if "a spring" in doubt] == [True] * (spring > 0)
+    asked = [target for unknown in draft.proposed for target in unknown.targets if "spring" in unknown.name]
+    assert asked == [f"{joint}.stiffness", f"{joint}.springref"] * (spring > 0)
 
 
 def test_samples_that_are_missing_hide_nothing(tmp_path: Path) -> None:

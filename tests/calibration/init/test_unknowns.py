@@ -100,14 +100,24 @@ def test_a_delay_that_explains_little_is_called_uncertain(times: float, clear: b
 
 
 @pytest.mark.parametrize(("size", "theta", "shown"), [(600.0, 0.5, True), (600.0, 0.01, False), (5.0, 0.5, False)])
-def test_a_spring_is_told_where_one_shows(size: float, theta: float, shown: bool) -> None:
-    """Of 4 N m/rad at most: with what it is about, its target, and its bounds."""
+def test_a_spring_is_asked_for_where_one_shows(size: float, theta: float, shown: bool) -> None:
+    """Of 4 N m/rad at most: with what it is about, and where it rests between the ends of the motion."""
     basis = np.linalg.qr(np.random.default_rng(0).standard_normal((400, 2)))[0]
     fit = Fit((0,), np.ones(1), np.array([0.5, theta]), basis * [500.0, size], np.ones(1))
-    mass, spring = Unknown("mass", (), 0.0, 1.0, False, ""), Unknown("s", ("joint:j.stiffness",), 0.0, 4.0, False, "")
-    lines = sprung([mass], [spring], fit)
-    assert bool(lines) is shown
-    assert all("of about 2 in SI" in line and "'joint:j.stiffness' as a parameter, [0, 4]" in line for line in lines)
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body name="arm"><joint name="j"/><geom size=".1"/></body></worldbody></mujoco>'
+    )
+    mass = Unknown("mass", (), 0.0, 1.0, False, "")
+    spring = Unknown("j_spring", ("joint:j.stiffness",), 0.0, 4.0, False, "")
+    states = np.array([[0.0, -0.7, 0.0], [0.1, 0.2, 0.0]])
+    asked, lines = sprung(model, [mass], [spring], fit, states)
+    assert [(u.name, u.targets, u.low, u.high) for u in asked] == [
+        ("j_spring", ("joint:j.stiffness",), 0.0, 4.0),
+        ("j_spring_rest", ("joint:j.springref",), -0.7, 0.2),
+    ] * shown
+    assert ["of about 2 in SI" in line and "'joint:j.stiffness' and 'joint:j.springref'" in line for line in lines] == [
+        True
+    ] * shown
 
 
 FOUR_BAR = """<mujoco><option timestep="0.002"/><worldbody>

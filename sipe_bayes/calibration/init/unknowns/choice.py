@@ -106,15 +106,34 @@ def roomy(model: mujoco.MjModel, unknown: Unknown, theta: float) -> Unknown:
     return replace(unknown, low=low, high=float(f"{high:.2g}"), note=note)
 
 
-def sprung(unknowns: Sequence[Unknown], beside: Sequence[Unknown], fit: Fit) -> list[str]:
-    """What is to be said of springs that stand behind the unknowns of a fit, where one shows clearly."""
-    out = []
+def sprung(
+    model: mujoco.MjModel, unknowns: Sequence[Unknown], beside: Sequence[Unknown], fit: Fit, states: FloatArray
+) -> tuple[list[Unknown], list[str]]:
+    """Springs that stand behind the unknowns of a fit and show clearly, with where they rest; what is said of them.
+
+    Args:
+        model: as given.
+        unknowns: of the fit.
+        beside: springs, after these in the fit.
+        fit: with the effects of each.
+        states: (n, S) of the logs: a spring rests where its joint has been.
+    """
+    asked, said = [], []
     for k, spring in enumerate(beside, len(unknowns)):
         shown = fit.jacobian[:, k] * fit.theta[k] / np.sqrt(max(1.0, len(fit.jacobian) / 400.0))
-        if float(np.linalg.norm(shown)) > _CLEAR and fit.theta[k] > _NOTABLE:
-            value, target = spring.low + fit.theta[k] * (spring.high - spring.low), spring.targets[0]
-            out.append(
-                f"a spring of about {value:.2g} in SI seems to act where the model has none: add {target!r} as "
-                f"a parameter, [{spring.low:g}, {spring.high:.2g}], and its springref"
-            )
-    return out
+        if not (float(np.linalg.norm(shown)) > _CLEAR and fit.theta[k] > _NOTABLE):
+            continue
+        value, target = spring.low + fit.theta[k] * (spring.high - spring.low), spring.targets[0]
+        joint = model.joint(target.removeprefix("joint:").removesuffix(".stiffness"))
+        places = [*states[:, 1 + int(joint.qposadr[0])], float(model.qpos_spring[joint.qposadr[0]])]
+        low, high = (float(f"{x:.2g}") for x in (min(places), max(places)))
+        rest = f"joint:{joint.name}.springref"
+        asked += [
+            replace(spring, high=rounded_up(spring.high), note=f"a spring that the model does not have, about {value:.2g}"),
+            Unknown(f"{spring.name}_rest", (rest,), low, high, False, "where it rests, between the ends of the motion"),
+        ]
+        said.append(
+            f"a spring of about {value:.2g} in SI seems to act where the model has none: {target!r} and {rest!r} are "
+            "asked for; take them out if there is none, and look for what pulls instead"
+        )
+    return asked, said
