@@ -9,7 +9,8 @@ in a sum of squares as much as thousands of good ones, so such samples are maske
   in the motion: a redescending estimator of two weights, all or nothing (P. Huber 1981, "Robust Statistics", 4.8).
 
 A residual's threshold is one that white noise passes once in 10^8 samples, so that a clean log loses none. Where so
-many would be masked that they are no accidents, none is.
+many would be masked that they are no accidents, none is. Right after a command jumps a residual does too, if the model
+follows it a little sooner or later: that is what tells of delays and gains, and stays.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.rotations import continued
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.noise import NORMAL_MAD
 from sipe_bayes.likelihood.windows import Windows
 
@@ -39,6 +41,7 @@ class WildOptions(Options):
     residual_share: float = option(1e-4, "of what the channel measured: less is the simulation's own", above=0)
     velocity_share: float = option(0.5, "the same of a velocity, which impacts and slips do move in a step", above=0)
     longest: int = option(3, "a residual may stay away where no measured position jumps: friction slips", "samples")
+    after: int = option(5, "a fast joint may follow a jump of a command", "samples", least=0)
     home: float = option(0.4, "how near it comes back to where it left", "of the jump", above=0, below=1)
     most: float = option(0.05, "share of a channel's samples from which they are no accidents", above=0, below=1)
     fewest: int = option(40, "samples of a log that tell how a position moves", least=10)
@@ -86,7 +89,7 @@ def wild_residuals(windows: Windows, residual: FloatArray) -> IntArray:
     Asked of channels that measure positions and velocities of the state. Rotation vectors are followed beyond half a
     turn, where a body that tumbles otherwise than its simulation would seem to flip.
     """
-    length, found = residual.shape[1], []
+    length, found, follows = residual.shape[1], [], _commanded(windows.trajectories)
     spread, residual = windows.spread, _continued(windows, residual)
     for c, sequence in enumerate(windows.sequences):
         index = sequence.index
@@ -98,7 +101,9 @@ def wild_residuals(windows: Windows, residual: FloatArray) -> IntArray:
         steps, within = np.abs(np.diff(series)), np.diff(log) == 0
         limit = np.maximum(WILD.residual_sds * _scale(steps[within]), least * spread[c])
         limit = np.maximum(WILD.residual_times * _around(steps), limit)
-        at, wild = np.flatnonzero((steps > limit) & within), np.zeros(len(index), bool)
+        sample = windows.start[sequence.window] + index % length
+        free = ~follows[log[1:], sample[1:]]
+        at, wild = np.flatnonzero((steps > limit) & within & free), np.zeros(len(index), bool)
         moved = np.abs(np.diff(windows.measured[..., c].reshape(-1)[index]))
         sudden = at[moved[at] > WILD.position_times * _around(moved)[at]]
         for number in np.unique(log[at]):
@@ -110,9 +115,19 @@ def wild_residuals(windows: Windows, residual: FloatArray) -> IntArray:
                 own, seen = np.setdiff1d(own, edges), np.setdiff1d(seen, edges)
             wild[first:past] = _away(rows, own, WILD.longest, edges) | _away(rows, seen, longest)
         if wild.any() and wild.sum() <= WILD.most * len(index):
-            sample = windows.start[sequence.window] + index % length
             found.append(np.stack([log[wild], sample[wild], np.full(wild.sum(), windows.channels[c])], axis=1))
     return np.concatenate(found) if found else np.zeros((0, 3), np.int64)
+
+
+def _commanded(logs: Trajectories) -> BoolArray:
+    """Which samples (B, T + 1) come right after a command jumped, unless it jumps all the time."""
+    follows = np.zeros(logs.observations.shape[:2], bool)
+    for own, actions, length in zip(follows, logs.actions, logs.length, strict=True):
+        for command in actions[:length].T:
+            at = jumps(command) + 1  # the first sample with the new one, which moves nothing yet
+            for k in at if len(at) <= WILD.most * length else ():
+                own[k + 1 : k + 1 + WILD.after] = True
+    return follows
 
 
 def _continued(windows: Windows, residual: FloatArray) -> FloatArray:

@@ -67,7 +67,8 @@ def test_what_the_rest_takes_is_an_estimate(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_the_pace_is_the_latest(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorter physics steps take sixteen times as long; what was done before says nothing of the rest."""
-    shown = paced(monkeypatch, *((10 * k, 10.0 * k) for k in range(1, 7)), *((60 + k, 60 + 20.0 * k) for k in range(15)))
+    quick, slow = [(10 * k, 10.0 * k) for k in range(1, 7)], [(60 + k, 60 + 20.0 * k) for k in range(15)]
+    shown = paced(monkeypatch, *quick, *slow)
     assert "60 of 100 rollouts, about 40 s" in shown[5]
     assert "74 of 100 rollouts, about 9 min" in shown[-1]  # 26 rollouts of 20 s
 
@@ -86,7 +87,8 @@ def test_an_interruption_says_what_there_is(
     config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Which is gone on from: dry friction is fitted and kept before the others are asked once more."""
-    monkeypatch.setattr("sys.argv", ["sipe", "discover", str(config), "--threads", "1", "--out", str(config.parent / "o")])
+    words = ["sipe", "discover", str(config), "--threads", "1", "--out", str(config.parent / "o")]
+    monkeypatch.setattr("sys.argv", words)
     monkeypatch.setattr("sipe_bayes.structure.search.StructureSearch._swap", _interrupted)
     with pytest.raises(SystemExit) as left:
         main()

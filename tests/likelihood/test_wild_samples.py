@@ -113,6 +113,24 @@ def test_where_a_short_last_window_starts_is_not_wild_and_what_jumps_within_one_
     assert wild_residuals(windows, residual).tolist() == [[0, 99, 0]]
 
 
+@pytest.mark.parametrize(("every", "wild"), [(25, 1), (100, 2), (0, 4)])
+def test_what_follows_a_jump_of_a_command_is_not_wild(every: int, wild: int) -> None:
+    """The model follows set-points a little late: off for two samples, and home. Glitches elsewhere are wild.
+
+    Stairs that jump all the time excuse nothing.
+    """
+    simulator = pendulums.pendulum()
+    recorded = pendulums.log(simulator, [0.6, 0.08], 3, steps=400)
+    at = np.arange(400)
+    command = np.sign(np.sin(np.pi * (at + 0.5) / every)) if every else np.random.default_rng(1).choice([-1, 1], 400)
+    logs = Trajectories.stack([replace(recorded, actions=0.1 * command[:, None])])
+    windows = Windows(Segments(None), simulator, logs)
+    residual = np.random.default_rng(0).normal(0, 1e-3, windows.observed.shape)
+    for place in (53, 103, 190, 202):  # the commands jump at multiples of 25 or of 100
+        residual[0, place : place + 2] += 1.0
+    assert len(wild_residuals(windows, residual)) == 2 * wild
+
+
 def test_what_a_known_start_ends_is_not_wild() -> None:
     """A simulation that missed an impact is off until the next window begins, at a state that is known."""
     simulator = pendulums.pendulum()

@@ -127,9 +127,10 @@ def sprung(
         joint = model.joint(target.removeprefix("joint:").removesuffix(".stiffness"))
         places = [*states[:, 1 + int(joint.qposadr[0])], float(model.qpos_spring[joint.qposadr[0]])]
         low, high = (float(f"{x:.2g}") for x in (min(places), max(places)))
+        about = f"a spring that the model does not have, about {value:.2g}"
         rest = f"joint:{joint.name}.springref"
         asked += [
-            replace(spring, high=rounded_up(spring.high), note=f"a spring that the model does not have, about {value:.2g}"),
+            replace(spring, high=rounded_up(spring.high), note=about),
             Unknown(f"{spring.name}_rest", (rest,), low, high, False, "where it rests, between the ends of the motion"),
         ]
         said.append(
