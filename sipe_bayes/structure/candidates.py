@@ -79,6 +79,24 @@ def candidates(
     return sorted(ranked.values(), key=lambda candidate: -candidate.gain)
 
 
+def promised(
+    windows: Windows,
+    theta: FloatArray,
+    starts: FloatArray,
+    noise: Noise,
+    prior: QuadraticPrior,
+    change: FloatArray,
+) -> float:
+    """Log-likelihood in nats that predictions which change so (W, L, C), by any amount, are to gain; at least none.
+
+    The other arguments are those of ``candidates``.
+    """
+    linearisation = windows.linearise(theta, starts)
+    around = _Around(windows, theta, starts, noise, prior, linearisation.residual, linearisation.jacobian)
+    plain, with_it = (around.fitted(c) for c in (np.zeros((*change.shape, 0)), change[..., None]))
+    return max(with_it.level - plain.level, 0.0) if with_it.amplitude[0] > 0 else 0.0
+
+
 @dataclass(frozen=True)
 class _Fitted:
     """The linear model with K probes at its best noise: log-likelihood, amplitudes (K,), whitened squares."""

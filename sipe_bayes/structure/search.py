@@ -234,14 +234,15 @@ class StructureSearch:
         return replace(state, queue=queue, phase=Phase.FIT if tried else Phase.STEPS)
 
     def _shorter_steps(self, state: DiscoverState) -> DiscoverState:
-        """The present structure in shorter physics steps: what is about to be named may be nothing but what they do."""
-        labels = self._ladder.finer(state.present)
+        """The present structure in shorter physics steps, which may be all, if they promise half their price."""
+        here, labels = state.here, self._ladder.finer(state.present)
         assert labels is not None
-        fitted = self._fitted(state, labels, state.here.theta)
+        least = self.options.step_share * state.promised
+        gain, rollouts = self.fitting.step_gain(self.structure(here.labels), self.structure(labels), here)
+        state = replace(state, rank_rollouts=state.rank_rollouts + rollouts)
+        fitted = self._fitted(state, labels, here.theta) if gain > 0.5 * self.price(labels[-1]) else state
         one = fitted.of(labels)
-        least = self.options.step_share
-        promised = max((o.gain for o in state.offers if o.at == state.present and o.label in state.queue), default=0.0)
-        if one is None or not self.better(one, state.here) or one.evidence - state.here.evidence < least * promised:
+        if one is None or not self.better(one, here) or one.evidence - here.evidence < least:
             return replace(fitted, phase=Phase.FIT)
         return replace(fitted, present=labels, queue=(), phase=Phase.RANK)
 

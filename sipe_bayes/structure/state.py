@@ -158,6 +158,12 @@ class DiscoverState:
         }[self.phase]
 
     @property
+    def promised(self) -> float:
+        """The most that something in the queue promises."""
+        gains = (o.gain for o in self.offers if o.at == self.present and o.label in self.queue)
+        return max(gains, default=0.0)
+
+    @property
     def so_far(self) -> str:
         """What a search that is interrupted has; nothing before the model as it is was fitted."""
         if not self.fitted:

@@ -24,7 +24,7 @@ from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Particles, prior
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure import Restriction, Structures, discover
-from sipe_bayes.structure.physics_step import PHYSICS_STEP, RUNS, StepLadder, step_error
+from sipe_bayes.structure.physics_step import PHYSICS_STEP, RUNS, StepLadder, shorter_steps, step_error
 from sipe_bayes.structure.registry import EXTENSIONS
 from tests.problems.pendulums import DT, log, pendulum, stepped
 
@@ -259,3 +259,18 @@ def test_a_structure_has_one_step_at_most() -> None:
     assert ladder.finer(("b", "friction")) is None
     assert [ladder.rung(labels) for labels in ((), ("a",), ("friction", "b"))] == [0, 1, 2]
     assert ladder.pieces(("friction", "b", "delay")) == ("friction", "delay")
+
+
+@pytest.mark.parametrize(("truth", "least", "most"), [(DT / 16, 30.0, 200.0), (DT, 0.0, 1.0)])
+def test_what_shorter_steps_promise_is_about_what_they_gain(truth: float, least: float, most: float) -> None:
+    """At the optimum of a log in fine steps as much as the fit then gains; of one in the model's own steps nothing."""
+    simulator, machine = pendulum(), pendulum(edits=[partial(stepped, seconds=truth)])
+    fitting = among(log(machine, [0.6, 0.08], 2, sd=0.002)).search.fitting
+    plain = fitting.fit([], None, 2000)
+    pieces = [p for p in shorter_steps(fitting.windows(simulator)) if p.label == "physics_step:2.5 ms"]
+    gain, rollouts = fitting.step_gain([], pieces, plain)
+    one = fitting.fit(pieces, plain.theta, 2000)
+    print(gain, one.evidence - plain.evidence)
+    assert rollouts > 2
+    assert least <= gain < most
+    assert 0.4 * gain - 1 < max(one.evidence - plain.evidence, 0.0) < 2.5 * gain + 1
