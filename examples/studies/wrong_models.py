@@ -39,6 +39,7 @@ from discover import DT, MACHINES, commands, plain, values
 import sipe_bayes as sipe
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import write_text
+from sipe_bayes.core.findings import Severity
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.agreement import disagreement, linear_estimates, parts_of
 from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
@@ -131,6 +132,7 @@ def fitted(name: str, effect: str, seed: int, size: float) -> Iterator[dict[str,
             "seed": seed,
             "unknown": unknown,
             "alarm": alarm,
+            "blocking": sorted(str(f.code) for f in method.findings if f.severity is Severity.BLOCKING),
             "truth": truth.tolist(),
             "ends": {kind: ends(p) for kind, p in kinds.items()},
             "causes": list(missing.causes),
@@ -183,6 +185,11 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, Any]:
     silent = [row for row in wrong if not row["alarm"]]
     if silent:
         out["wrong, without an alarm"] = shares(silent)
+    doubted = [row for row in wrong if row["alarm"] and row.get("blocking")]
+    if doubted:
+        out["wrong, with an alarm, the fit itself blocked"] = shares(doubted) | {
+            "blocking": sorted({code for row in doubted for code in row["blocking"]})
+        }
     for unknown, what in ((False, "in the library"), (True, "unknown")):
         mine = [row for row in wrong if row["unknown"] == unknown]
         if mine:
