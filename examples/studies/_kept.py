@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,12 @@ def fits(path: Path) -> list[dict[str, Any]]:
     if any(row.get("source") != source() for row in found):
         raise SystemExit(f"{path}: holds fits that another state of the package's code made; delete it and run again")
     return found
+
+
+def ensure(path: Path, which: dict[str, Any], made: Callable[[], dict[str, Any]]) -> None:
+    """Make a fit that is not in the file yet, keep it and print it; which: what tells it from the others."""
+    if not any(which.items() <= row.items() for row in fits(path)):
+        print(json.dumps(keep(path, made())), flush=True)
 
 
 def keep(path: Path, row: dict[str, Any]) -> dict[str, Any]:

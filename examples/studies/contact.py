@@ -22,12 +22,13 @@ import argparse
 import json
 import time
 from fnmatch import fnmatch
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _kept import fits, keep
+from _kept import ensure, fits
 
 import sipe_bayes as sipe
 from sipe_bayes.core.files import write_text
@@ -167,8 +168,7 @@ def main() -> None:
     for seed in range(*given.seeds):
         for name, level in (cell.split("/") for cell in chosen):
             which = {"model": name, "level": float(level), "steps": given.steps, "seed": seed}
-            if not any(which.items() <= row.items() for row in fits(file)):
-                print(json.dumps(keep(file, one_fit(name, float(level), seed, given.steps))), flush=True)
+            ensure(file, which, partial(one_fit, name, float(level), seed, given.steps))
     by_cell: dict[str, list[dict[str, Any]]] = {}
     for row in fits(file):
         by_cell.setdefault(f"{row['model']}, {row['level']:.0%}, {row['steps']} steps", []).append(row)

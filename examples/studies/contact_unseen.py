@@ -14,13 +14,14 @@ from __future__ import annotations
 
 import argparse
 import json
+from functools import partial
 from importlib.metadata import version
 from itertools import product
 from typing import Any
 
 import contact
 import numpy as np
-from _kept import fits, keep
+from _kept import ensure, fits
 
 import sipe_bayes as sipe
 from sipe_bayes.core.arrays import FloatArray
@@ -132,8 +133,7 @@ def main() -> None:
     file = RUNS / "fits.jsonl"
     for seed, name in product(range(*given.seeds), given.machines):
         which = {"model": name, "level": LEVEL, "steps": STEPS, "seed": seed}
-        if not any(which.items() <= row.items() for row in fits(file)):
-            print(json.dumps(keep(file, contact.one_fit(name, LEVEL, seed, STEPS))), flush=True)
+        ensure(file, which, partial(contact.one_fit, name, LEVEL, seed, STEPS))
     rows: list[dict[str, Any]] = sorted(fits(file), key=lambda row: row["seed"])
     table = {
         "command": f"python examples/studies/contact_unseen.py --seeds {given.seeds[0]} {given.seeds[1]}",

@@ -25,13 +25,14 @@ import math
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from _kept import fits, keep
+from _kept import ensure, fits
 
 import sipe_bayes as sipe
 from sipe_bayes.benchmark.measurement import source
@@ -267,8 +268,8 @@ def main() -> None:
     given = parser.parse_args()
     for machine in given.machine:
         for seed in range(*given.seeds):
-            if not any(row["machine"] == machine and row["seed"] == seed for row in fits(KEPT)):
-                print(json.dumps(keep(KEPT, one_machine(machine, seed, not given.no_discover))), flush=True)
+            made = partial(one_machine, machine, seed, not given.no_discover)
+            ensure(KEPT, {"machine": machine, "seed": seed}, made)
     rows = sorted(fits(KEPT), key=lambda row: (row["machine"], row["seed"]))
     table = {
         "commands": sorted({row["command"] for row in rows}),

@@ -17,12 +17,13 @@ import argparse
 import json
 import time
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _kept import fits, keep
+from _kept import ensure, fits
 from contact import summary
 
 import sipe_bayes as sipe
@@ -79,9 +80,7 @@ def main() -> None:
     for name in given.select:
         for seed in range(*given.seeds):
             which = {"model": name, "seed": seed, "known": given.known, "budget": given.budget}
-            if not any(which.items() <= row.items() for row in fits(FILE)):
-                row = one_fit(name, seed, given.known, given.budget)
-                print(json.dumps(keep(FILE, row)), flush=True)
+            ensure(FILE, which, partial(one_fit, name, seed, given.known, given.budget))
     by_cell: dict[str, list[dict[str, Any]]] = {}
     for row in fits(FILE):
         cell = f"{row['model']}, every {row['known']} steps, {row['budget']} rollouts"

@@ -19,13 +19,14 @@ import argparse
 import json
 import sys
 import time
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from _kept import fits, keep
+from _kept import ensure, fits
 
 import sipe_bayes as sipe
 from sipe_bayes.core.files import write_text
@@ -216,8 +217,7 @@ def main() -> None:
     file = RUNS / "rows.jsonl"
     for seed in range(*given.seeds):
         for name in given.select:
-            if not any({"model": name, "seed": seed}.items() <= row.items() for row in fits(file)):
-                print(json.dumps(keep(file, one_row(name, seed))), flush=True)
+            ensure(file, {"model": name, "seed": seed}, partial(one_row, name, seed))
     rows = fits(file)
     table = {
         "command": "python examples/studies/particles.py --seeds 0 N, for the logs of each model",

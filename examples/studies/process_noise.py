@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import argparse
 import json
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _kept import fits, keep
+from _kept import ensure, fits
 from particles import MODELS, logged
 from scipy.stats import norm
 
@@ -79,8 +80,7 @@ def main() -> None:
     given = parser.parse_args()
     for seed in range(*given.seeds):
         for name, share in ((name, share) for name in given.select for share in given.shares):
-            if not any({"model": name, "seed": seed, "share": share}.items() <= row.items() for row in fits(FILE)):
-                print(json.dumps(keep(FILE, one_row(name, seed, share))), flush=True)
+            ensure(FILE, {"model": name, "seed": seed, "share": share}, partial(one_row, name, seed, share))
     cells: dict[str, list[dict[str, Any]]] = {}
     for row in fits(FILE):
         cells.setdefault(f"{row['model']}, {row['share']:g}", []).append(row)

@@ -253,14 +253,14 @@ class StructureSearch:
         fitting, own = self.fitting, self.structure(here.labels)
         simulator = fitting.simulator(own)
         windows, prior = fitting.windows(simulator), QuadraticPrior.of(fitting.prior_of(simulator))
-        targets = {t for p in own for q in p.parameters for t in q.targets}
-        rest = [p for p in self._placed.values() if p.extension.last_resort == last_resort]
-        rest = [p for p in rest if not targets & {t for q in p.parameters for t in q.targets}]
-        rest = [p for p in rest if p.parameters and p.label not in here.labels]
+        taken = {*here.labels, *(t for p in own for q in p.parameters for t in q.targets)}
+        rest = [p for p in self._placed.values() if p.extension.last_resort == last_resort and p.parameters]
+        rest = [p for p in rest if not taken & {p.label, *(t for q in p.parameters for t in q.targets)}]
         windows.budget, ranked, cut = self._left(state), list[Candidate](), None
         try:
             if rest:
-                ranked = candidates(windows, here.theta, here.starts, here.noise, prior, rest, self._tell)
+                at = here.theta, here.starts, here.noise, prior
+                ranked = candidates(windows, *at, rest, lambda what: self._tell(what, windows.rollouts))
         except BudgetExhausted:
             cut = state.phase
         offers = tuple(Offer(here.labels, c.placed.label, c.gain, c.theta, c.others) for c in ranked)
