@@ -146,5 +146,8 @@ def run_discovery(
             if progress is not None:
                 progress(f"comparing before and after: {what}", structures.rollouts, structures.rollouts)
 
-        discovery = summarise(problem, structures, name, chosen, began, tell)
+        try:
+            discovery = summarise(problem, structures, name, chosen, began, tell)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(structures.state.so_far) from None
         return write_discovery(replace(discovery, run=record, out=str(folder)), structures, problem, folder)

@@ -83,13 +83,16 @@ def paced(monkeypatch: pytest.MonkeyPatch, *done: tuple[int, float]) -> list[str
     return shown
 
 
+@pytest.mark.parametrize(
+    "during", ["sipe_bayes.structure.search.StructureSearch._swap", "sipe_bayes.calibration.discover.summarise"]
+)
 def test_an_interruption_says_what_there_is(
-    config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    during: str, config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Which is gone on from: dry friction is fitted and kept before the others are asked once more."""
+    """Which is gone on from: dry friction is fitted and kept before the others are asked once more, and after all."""
     words = ["sipe", "discover", str(config), "--threads", "1", "--out", str(config.parent / "o")]
     monkeypatch.setattr("sys.argv", words)
-    monkeypatch.setattr("sipe_bayes.structure.search.StructureSearch._swap", _interrupted)
+    monkeypatch.setattr(during, _interrupted)
     with pytest.raises(SystemExit) as left:
         main()
     assert left.value.code == 130
