@@ -37,6 +37,7 @@ from sipe_bayes.diagnostics.misfit.probed_logs import MISFIT, ProbedLogs
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.structure.registry import get_extension
 
 HERE = Path(__file__).parent
 RUNS = HERE / "runs" / "misspecification"
@@ -51,6 +52,7 @@ SIZES = {  # N m; control steps; share of the torque
     "delay": (1, 2, 4),
     "friction under load": (0.05, 0.1, 0.2),
 }
+EXTENSION_OF = {"dry friction": "dry_friction", "delay": "delay", "friction under load": "load_friction"}
 SEEDS = {"null": 100, "dry friction": 20, "delay": 20, "friction under load": 20}
 NOISES = {"white": 0.0, "ar1": 0.9}
 
@@ -122,7 +124,8 @@ def study(engine: sipe.Simulator, cell: str, size: float, noise: str, seeds: int
     alarms = [row for row in rows if row["p"] <= THRESHOLDS.misfit]
     causes = [row["cause"] for row in alarms]
     # causes that explain about as much are named together
-    right = [row for row in alarms if cause_of(cell, row["seed"] % joints) in row["cause"].split(" or ")]
+    planted = [row for row in alarms if cell != "null"]
+    right = [row for row in planted if cause_of(cell, row["seed"] % joints) in row["cause"].split(" or ")]
     channel = [row for row in alarms if row["channel"] == f"joint:hinge{1 + row['seed'] % joints}.position"]
     return {
         "cell": cell,
@@ -139,7 +142,8 @@ def study(engine: sipe.Simulator, cell: str, size: float, noise: str, seeds: int
 
 def cause_of(cell: str, joint: int) -> str:
     """What the check calls it."""
-    return f"a delay of motor{joint + 1}" if cell == "delay" else f"{cell} at hinge{joint + 1}"
+    site = f"{'motor' if cell == 'delay' else 'hinge'}{joint + 1}"
+    return get_extension(EXTENSION_OF[cell]).sentence(site)
 
 
 def main() -> None:

@@ -41,7 +41,7 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.agreement import linear_estimates, parts_of
 from sipe_bayes.diagnostics.misfit.library_discrepancy import library_discrepancy
-from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs, remembering
+from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs, oddness, remembering
 from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances, named, untold, widened
 from sipe_bayes.inference.random_effects import LogEstimate, random_effects
 from sipe_bayes.likelihood.noise import Noise
@@ -218,9 +218,8 @@ class _Causes:
         step = np.concatenate([self.step[: logs.windows.num_theta], self.sizes(logs)])
         seen = logs.whiteness(logs.left(logs.residual, step, arrow.blocks(step)), self.noise)
         null = logs.null(seed, MISFIT.simulated)[:, len(logs.probes) :]
-        middle, spread = null.mean(0), np.maximum(null.std(0), 1e-12)
-        odd, largest = ((seen - middle) / spread).max(), ((null - middle) / spread).max(1)
-        return bool((1 + (largest >= odd).sum()) / (1 + len(null)) > THRESHOLDS.misfit)
+        odd, largest = oddness(seen, null)
+        return bool((1 + (largest >= odd.max()).sum()) / (1 + len(null)) > THRESHOLDS.misfit)
 
     def widened(self, logs: ProbedLogs, further: Particles, random: np.random.Generator) -> Particles:
         """With what is not known of their sizes, and what they trade with theta."""

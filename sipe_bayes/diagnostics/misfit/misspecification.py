@@ -12,11 +12,11 @@ against a bound) and autoregressive noise, two kinds of statistics are looked at
   time.
 
 The null is simulated: noise as estimated, drawn anew, estimated anew, projected alike. Each statistic's cube root is
-standardised by its mean and sd over these; the largest is compared with the largest of each. Draws end where ten were
-odder (J. Besag, P. Clifford 1991, "Sequential Monte Carlo p-values", https://doi.org/10.1093/biomet/78.2.301), looked
-at after 40, 60 and 80 and not after each, so that p is (1 + odder) / (1 + drawn). So the
-p-value holds for white and first-order autoregressive sensor noise, whatever the number of probes, up to the
-linearisation.
+standardised by its mean and sd over these and the log's; the largest is compared with the largest of each. Draws end
+where ten were odder (J. Besag, P. Clifford 1991, "Sequential Monte Carlo p-values",
+https://doi.org/10.1093/biomet/78.2.301), looked at after 40, 60 and 80 and not after each, so that p is
+(1 + odder) / (1 + drawn). So the p-value holds for white and first-order autoregressive sensor noise, whatever the
+number of probes, up to the linearisation.
 
 A small p says that something is there, not that it is large: with it come the share of each channel's residual that the
 named cause explains and, of a probe, how far the estimate would move if the model had it.
@@ -40,7 +40,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
-from sipe_bayes.diagnostics.misfit.probed_logs import MISFIT, ProbedLogs, Solved, lags
+from sipe_bayes.diagnostics.misfit.probed_logs import MISFIT, ProbedLogs, Solved, lags, oddness
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.structure.probes import Probe
 
@@ -71,9 +71,7 @@ class _Named:
         logs = self.logs
         seen = logs.seen
         for count in (*range(2 * MISFIT.batch, simulated, MISFIT.batch), simulated):
-            null = logs.null(seed, count)
-            middle, spread = null.mean(0), np.maximum(null.std(0), 1e-12)
-            odd, largest = (seen.statistics - middle) / spread, ((null - middle) / spread).max(1)
+            odd, largest = oddness(seen.statistics, logs.null(seed, count))
             if (largest >= odd.max()).sum() >= MISFIT.exceeded:
                 break
 
