@@ -121,8 +121,8 @@ def outside_prior(
                 continue
             kept = known[np.linspace(0, len(known) - 1, min(PREDICTIVE.samples, len(known))).round().astype(int)]
             simulated = np.stack([one[k, kept, c] for one in made])
-            scale = np.maximum(simulated.std(0), PREDICTIVE.least * float(windows.spread[i]))
-            far[k, i] = _outlier_factors(simulated, log.observations[kept, c], scale)
+            least = PREDICTIVE.least * float(windows.spread[i])
+            far[k, i], scale = outlier_factors(simulated, log.observations[kept, c], least)
             gap = np.abs(log.observations[kept, c] - simulated.mean(0)) / np.maximum(scale, 1e-12)
             farthest[k, i] = kept[gap.argmax()] * log.dt
     largest = far[..., 1:].max((0, 1))
@@ -186,11 +186,16 @@ def _predictive(windows: Windows, logs: Trajectories, prior: Posterior, noise: N
     return [written_near(one.observations, seen, rotations) for one in made if one is not None]
 
 
-def _outlier_factors(simulated: FloatArray, log: FloatArray, scale: FloatArray) -> FloatArray:
-    """Local outlier factors (1 + n,) of the log (F,) and of n simulations (n, F) among one another, in scales (F,)."""
+def outlier_factors(simulated: FloatArray, log: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
+    """Local outlier factors (1 + n,) of the log (F,) and of n simulations (n, F) among one another, and scales (F,).
+
+    A sample's scale is the sd over all of them, the log among them, so that under the null each is as likely to be the
+    farthest; at least ``least``. Nothing is told where the simulations do not vary.
+    """
     every, varies = np.concatenate([log[None], simulated]), simulated.std(0) > 1e-12
+    scale = np.maximum(every.std(0), least)
     if not varies.any():
-        return np.zeros(len(every))
+        return np.zeros(len(every)), scale
     points = every[:, varies] / scale[varies]
     apart = np.sqrt(((points[:, None] - points) ** 2).sum(-1))
     np.fill_diagonal(apart, np.inf)
@@ -198,4 +203,4 @@ def _outlier_factors(simulated: FloatArray, log: FloatArray, scale: FloatArray) 
     ways = np.take_along_axis(apart, near, axis=1)
     # how densely the neighbourhood is filled, a way counted as no shorter than the neighbour's own to its k-th
     density = 1 / (np.maximum(ways, ways[near, -1]).mean(1) + 1e-10)
-    return np.asarray(density[near].mean(1) / density)
+    return np.asarray(density[near].mean(1) / density), scale
