@@ -149,5 +149,5 @@ def run_discovery(
         try:
             discovery = summarise(problem, structures, name, chosen, began, tell)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(structures.state.so_far) from None
+            raise KeyboardInterrupt(structures.so_far) from None
         return write_discovery(replace(discovery, run=record, out=str(folder)), structures, problem, folder)

@@ -213,7 +213,7 @@ ADVICE: dict[Code, str] = {
         "true`. If not, the model lacks what the logs show differently: `sipe discover`."
     ),
     Code.LOGS_DISAGREE_UNEXPLAINED: _REMEDY_LACKING,
-    Code.AGREEMENT_UNKNOWN: "The log alone is too short or too poor. It still counts in the joint fit.",
+    Code.AGREEMENT_UNKNOWN: "Alone it is too short or poor, or no optimum came. It still counts in the joint fit.",
     Code.HELD_OUT_DIVERGES: (
         "The calibrated model explodes on a motion that it was not fitted on: look at parameters at a bound, train "
         "on such motion too."

@@ -317,8 +317,8 @@ class Code(Enum):
         "disagrees between logs",
     )
     LOGS_DISAGREE_UNEXPLAINED = blocking(
-        "the logs disagree (p = {p:.1g}) and no single parameter explains it: the model lacks something that differs "
-        "between them; {most}{without}",
+        "the logs disagree (p = {p:.1g}) and no single parameter explains it: the model lacks something that shows "
+        "differently in them; {most}{without}",
         "disagrees between logs",
     )
     AGREEMENT_UNKNOWN = caution("log {log} could not be fitted by itself; whether it agrees is unknown")

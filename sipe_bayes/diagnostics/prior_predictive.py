@@ -41,6 +41,7 @@ class PredictiveOptions(Options):
     )
     samples: int = option(50, "of a log: more are correlated, and distances in many dimensions alike", least=1)
     fewest: int = option(5, "samples of a window from which its bends are told", least=3)
+    moving: float = option(0.1, "of the window that bends most: less is rest", least=0, most=1)
     neighbours: int = option(20, "of the local outlier factor, as its authors advise", least=1)
 
 
@@ -145,7 +146,8 @@ def follows(windows: Windows, predicted: FloatArray) -> bool:
     """Whether simulations bend as the logs do, in every channel: with a wrong unit or sign they do not.
 
     What a straight line in time leaves of the median window is compared with what it leaves of the difference: a start
-    that is slightly off leaves such a line.
+    that is slightly off leaves such a line. Windows in which a channel rests, as one that is only pushed now and then,
+    do not count for it.
 
     Args:
         windows: of the logs.
@@ -161,7 +163,9 @@ def follows(windows: Windows, predicted: FloatArray) -> bool:
                 pairs.append(np.linalg.norm(both - both @ line @ line.T, axis=1))
         if not pairs:
             continue
-        left, whole = np.median(pairs, axis=0)
+        bends = np.array(pairs)
+        moving = bends[:, 1] >= PREDICTIVE.moving * bends[:, 1].max()  # of what rests noise alone is left
+        left, whole = np.median(bends[moving], axis=0)
         if not left < THRESHOLDS.followed * whole:
             return False
     return True

@@ -210,6 +210,7 @@ class Misfit:
         shift: for each parameter by how many posterior sds its estimate would move if the model had the cause; empty
             where that cannot be told.
         floor: the least p that the draws of the null can give.
+        alike: how many causes explain about as much, the cause's words naming them all.
     """
 
     p: float
@@ -222,6 +223,7 @@ class Misfit:
     share: dict[str, float] = field(default_factory=dict)
     shift: dict[str, float] = field(default_factory=dict)
     floor: float = 0.0
+    alike: int = 1
 
     @property
     def alarm(self) -> bool:

@@ -73,9 +73,9 @@ def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdic
     if Code.AT_PHYSICAL_BOUND in codes and not findings.blocking:
         return Verdict("good", f"{TEXTS[Code.AT_PHYSICAL_BOUND].row}, at most the upper end")
     partly = f"; {TEXTS[Code.DEAD_RANGE].row}" if Code.DEAD_RANGE in codes else ""
-    if parameter.contraction < THRESHOLDS.well_determined or _wide(parameter, THRESHOLDS.well_determined):
-        return Verdict("fair", "weakly determined" + partly)
     doubted = "; doubted above" if findings.blocking else ""
+    if parameter.contraction < THRESHOLDS.well_determined or _wide(parameter, THRESHOLDS.well_determined):
+        return Verdict("fair", "weakly determined" + partly + doubted)
     return Verdict("fair" if partly or doubted else "good", "determined" + partly + doubted)
 
 
@@ -120,18 +120,20 @@ def doubt(calibration: Calibration) -> str | None:
     return doubts[0] if doubts else None
 
 
-def _use(parameters: Sequence[ParameterSummary], findings: Findings, bands: BandCoverage | None) -> Verdict:
-    """What a model that lacks something may be used for."""
+def _use(
+    parameters: Sequence[ParameterSummary], findings: Findings, bands: BandCoverage | None, better: bool
+) -> Verdict:
+    """What a model that lacks something may be used for; better: than the model as given, on held-out logs."""
     tones = {p.name: parameter_verdict(p, findings).tone for p in parameters}
     usable, open_ = [n for n, tone in tones.items() if tone != "bad"], [n for n, tone in tones.items() if tone == "bad"]
     text = "It does not tell how well it predicts"
     if bands is not None:
         held = f"hold {100 * bands.share:.0f} ± {number(100 * bands.error, 1)} % of the held-out samples"
-        text = f"Use it to predict: its 90 % bands {held}"
+        text = f"Use it to predict: its 90 % bands {held}" if better else f"Its 90 % bands {held}"
         off = bands.share - THRESHOLDS.shown_interval
         if abs(off) > 2 * bands.error + THRESHOLDS.band_off:
-            text = "Use it to predict, within less than its bands" if off > 0 else "Do not rely on its bands"
-            text += f": those of 90 % {held}"
+            narrower = "Use it to predict, within less than its bands" if better else "Its bands are too wide"
+            text = f"{narrower if off > 0 else 'Do not rely on its bands'}: those of 90 % {held}"
         widths = list(bands.half.items())[:_DOUBTS]
         half = ", ".join(f"± {number(width, 2)} {unit}".rstrip() + f" in {name}" for name, (width, unit) in widths)
         text += f" ({half})"
@@ -147,7 +149,11 @@ def _few(names: Sequence[str]) -> str:
 
 
 def headline(
-    parameters: Sequence[ParameterSummary], findings: Findings, bands: BandCoverage | None = None, brief: bool = False
+    parameters: Sequence[ParameterSummary],
+    findings: Findings,
+    bands: BandCoverage | None = None,
+    brief: bool = False,
+    better: bool = True,
 ) -> Verdict:
     """Which of the parameters, nuisance ones aside, may be trusted; none while a finding blocks.
 
@@ -158,6 +164,7 @@ def headline(
         findings: about them.
         bands: what those of the held-out logs hold.
         brief: the first of the doubts, without its remedy, where all of them stand beside it.
+        better: whether held-out logs do not speak against it as a prediction.
     """
     wanted = [p for p in parameters if not p.nuisance]
     if not wanted:
@@ -171,7 +178,7 @@ def headline(
         first = "; ".join(doubts[:_DOUBTS])
         return Verdict("bad", f"No value may be trusted within its interval yet: {first}{others}.")
     if any(p.further is not None for p in wanted) and _lacks(findings):
-        return _use(wanted, findings, bands)
+        return _use(wanted, findings, bands, better)
     good = [p.name for p in wanted if parameter_verdict(p, findings).tone == "good"]
     if not good:
         return Verdict("bad", "No value may be trusted within its interval; the table says why.")
@@ -237,6 +244,8 @@ def _margin(comparison: Comparison) -> str:
 def lack(calibration: Calibration) -> Verdict | None:
     """What the model lacks, where that matters; the warnings say more."""
     misfit = calibration.misfit
+    if misfit is None and any(f.code is Code.MISFIT_NOT_ASKED for f in calibration.findings):
+        return Verdict("fair", "Whether the model lacks something was not asked: the fit goes through impacts.")
     if misfit is None or not misfit.alarm:
         return None
     share = f"{number(100 * misfit.share[misfit.channel], 2)} % of the residual of {misfit.channel}"
@@ -244,6 +253,8 @@ def lack(calibration: Calibration) -> Verdict | None:
         return Verdict("fair", f"The model lacks something small: it looks like {misfit.cause} ({share}).")
     text = f"The model lacks something: it looks like {misfit.cause} ({share}, {misfit.p_text})."
     text += " `sipe discover` tries it." if misfit.shift else ""
+    if misfit.alike > 1:  # with which of them values would move is open
+        return Verdict("bad", text)
     moved = sorted(misfit.moved, key=lambda name: -abs(misfit.shift[name]))[:_DOUBTS]
     beyond = [name for name in misfit.moved if _led_out(calibration, name, misfit.shift[name])]
     if beyond:  # so far off no value is near what a fit with it would give
@@ -293,8 +304,9 @@ def verdicts(calibration: Calibration, brief: bool = False) -> list[Verdict]:
     """
     findings = Findings(calibration.findings)
     predicted = prediction(calibration.holdout, calibration.comparison)
-    first = [headline(calibration.parameters, findings, calibration.bands, brief), predicted]
-    if predicted.tone == "bad":
+    better = predicted.tone != "bad"
+    first = [headline(calibration.parameters, findings, calibration.bands, brief, better), predicted]
+    if not better:
         first.reverse()
     mixing = mixing_verdict(calibration)
     if mixing is not None and mixing.tone == "bad" and any(f.code is Code.NOT_MIXED for f in findings.blocking):

@@ -124,7 +124,7 @@ def discover(
         try:
             state = search.step(state)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(state.so_far) from None  # who is told need not wait for the end
+            raise KeyboardInterrupt(Structures(search, state).so_far) from None  # who is told need not wait for the end
         if checkpoint is not None and (state.done or time.monotonic() - saved > _SAVE_SECONDS):
             save_state(checkpoint, before if state.cut else state, fingerprint)  # a larger budget takes that step anew
             saved = time.monotonic()

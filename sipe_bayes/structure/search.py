@@ -234,13 +234,13 @@ class StructureSearch:
         return replace(state, queue=queue, phase=Phase.FIT if tried else Phase.STEPS)
 
     def _shorter_steps(self, state: DiscoverState) -> DiscoverState:
-        """The present structure in shorter physics steps, which may be all, if they promise half their price."""
-        here, labels = state.here, self._ladder.finer(state.present)
-        assert labels is not None
+        """The present structure in shorter physics steps, which may be all, if they promise half of what they must."""
+        here, labels = state.here, self._ladder.finer(state.present) or ()
         least = self.options.step_share * state.promised
         gain, rollouts = self.fitting.step_gain(self.structure(here.labels), self.structure(labels), here)
         state = replace(state, rank_rollouts=state.rank_rollouts + rollouts)
-        fitted = self._fitted(state, labels, here.theta) if gain > 0.5 * self.price(labels[-1]) else state
+        worth = gain > 0.5 * max(self.price(labels[-1]), least)
+        fitted = self._fitted(state, labels, here.theta) if worth else state
         one = fitted.of(labels)
         if one is None or not self.better(one, here) or one.evidence - here.evidence < least:
             return replace(fitted, phase=Phase.FIT)

@@ -164,17 +164,6 @@ class DiscoverState:
         return max(gains, default=0.0)
 
     @property
-    def so_far(self) -> str:
-        """What a search that is interrupted has; nothing before the model as it is was fitted."""
-        if not self.fitted:
-            return ""
-        count = f"{len(self.fitted)} structures fitted" if len(self.fitted) > 1 else "the model as it is fitted"
-        if not self.present:
-            return f"{count}, nothing kept so far"
-        gain = self.here.evidence - self.fitted[0].evidence
-        return f"{count}, kept so far {' + '.join(self.present)}, {gain:.0f} nats over the model as it was"
-
-    @property
     def done(self) -> bool:
         """Whether the search has ended."""
         return self.phase is Phase.DONE

@@ -77,6 +77,21 @@ class Structures:
         enough = self.state.done and self.state.cut in (None, Phase.RESIDUAL)
         return enough and all(one.settled for p, one in zip(self.probabilities, self.fitted, strict=True) if p)
 
+    @property
+    def so_far(self) -> str:
+        """What a search that is interrupted has, with the values of what it keeps; nothing before its first fit."""
+        if not self.fitted:
+            return ""
+        count = f"{len(self.fitted)} structures fitted" if len(self.fitted) > 1 else "the model as it is fitted"
+        if not self.state.present:
+            return f"{count}, nothing kept so far"
+        here, sizes = self.state.here, []
+        own = [parameter for piece in self.placed(here) for parameter in piece.parameters]
+        for parameter, theta in zip(own, here.theta[len(here.theta) - len(own) :], strict=True):
+            sizes.append(f"{parameter.targets[0]} {float(parameter.value(theta)):.3g} {parameter.unit}".rstrip())
+        kept = " + ".join(here.labels) + (f" ({', '.join(sizes)})" if sizes else "")
+        return f"{count}, kept so far {kept}, {here.evidence - self.plain.evidence:.0f} nats over the model as it was"
+
     @cached_property
     def probabilities(self) -> FloatArray:
         """(S,) of the fitted structures; zero where held-out pieces speak against one, or a piece has no name."""

@@ -42,6 +42,7 @@ def test_regular_log_passes_bit_for_bit(tmp_path: Path, values: np.ndarray, rate
     np.testing.assert_array_equal(trajectory.actions[:, 0], values[:-1, 1])
     assert trajectory.dt == pytest.approx(1 / rate, rel=1e-6)
     assert not report.resampled
+    assert report.jitter_s == 0.0
     assert report.missing == {"q": 0}
 
 

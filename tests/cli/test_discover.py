@@ -97,7 +97,8 @@ def test_an_interruption_says_what_there_is(
         main()
     assert left.value.code == 130
     said = capsys.readouterr().err
-    assert re.search(r"sipe: interrupted: \d+ structures fitted, kept so far dry_friction:hinge, \d\d+ nats", said)
+    size = r"\(joint:hinge.frictionloss 0.1\d* N m\)"
+    assert re.search(rf"interrupted: \d+ structures fitted, kept so far dry_friction:hinge {size}, \d\d+ nats", said)
     assert said.rstrip().endswith("over the model as it was; the same command goes on")
 
 

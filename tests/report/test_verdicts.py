@@ -192,6 +192,13 @@ def test_what_the_model_lacks_says_where_values_would_be(calibration: Calibratio
     coloured = judged.lack(dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, shift={})))
     assert coloured is not None
     assert "would" not in coloured.text
+    tied = judged.lack(dataclasses.replace(calibration, misfit=dataclasses.replace(LACKS, alike=2)))
+    assert tied is not None  # with which of the two is open
+    assert tied.text.endswith("tries it.")
+    impacts = dataclasses.replace(calibration, findings=(noticed(Code.MISFIT_NOT_ASKED, severity=Severity.NOTE),))
+    assert judged.lack(impacts) == judged.Verdict(
+        "fair", "Whether the model lacks something was not asked: the fit goes through impacts."
+    )
 
 
 def test_headline_counts_without_nuisance_parameters() -> None:
@@ -218,6 +225,7 @@ def test_headline_counts_without_nuisance_parameters() -> None:
     assert brief == "No value may be trusted within its interval yet: the budget ran out."
     assert judged.parameter_verdict(good, Findings()).tone == "good"
     assert judged.parameter_verdict(good, doubts).tone == "fair"
+    assert judged.parameter_verdict(weak, doubts).text == "weakly determined; doubted above"
 
 
 def test_a_model_that_lacks_something_is_used_for_what_it_can_do() -> None:
@@ -241,6 +249,8 @@ def test_a_model_that_lacks_something_is_used_for_what_it_can_do() -> None:
     assert off.text.startswith("Do not rely on its bands: those of 90 % hold 60 ± 3 %")
     cautious = judged.headline([narrow, wide], lacks, dataclasses.replace(held, share=0.99, error=0.004))
     assert cautious.text.startswith("Use it to predict, within less than its bands: those of 90 % hold 99 ± 0.4 %")
+    worse = judged.headline([narrow, wide], lacks, held, better=False).text
+    assert worse.startswith("Its 90 % bands hold 88 ± 3 % of the held-out samples")
     assert judged.headline([wide], lacks).text == "It does not tell how well it predicts; damping not at all."
     doubted = Findings([*lacks, doubt("the chains have not mixed", Code.NOT_MIXED)])
     assert "yet: the chains have not mixed" in judged.headline([narrow, wide], doubted, held).text

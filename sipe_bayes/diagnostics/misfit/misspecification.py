@@ -101,9 +101,9 @@ class _Named:
         shift = (np.clip(logs.theta + moved, 0, 1) - logs.theta) / np.maximum(sd, 1e-12)
         causes = self._alike(probe, seen)
         cause, remedy = " or ".join(c.name for c in causes), " or ".join(c.remedy for c in causes)
-        return self._placed(
-            p, cause, f"{remedy}; or run sipe discover", gains, share, dict(zip(names, shift.tolist(), strict=True))
-        )
+        moves = dict(zip(names, shift.tolist(), strict=True))
+        named = self._placed(p, cause, f"{remedy}; or run sipe discover", gains, share, moves)
+        return replace(named, alike=len(causes))
 
     def _alike(self, probe: int, seen: Solved) -> list[Probe]:
         """The best probe and those of other causes that explain about as much, best first."""

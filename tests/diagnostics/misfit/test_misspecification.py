@@ -288,6 +288,15 @@ def test_a_model_that_lacks_something_follows_a_log_and_one_in_a_wrong_unit_does
         other = Trajectory(factor * inside.observations, inside.actions, inside.dt, channels=inside.channels)
         windows = bind(get_estimator(simulator, "laplace").likelihood, simulator, Trajectories.stack([other]))
         assert follows(windows, both_predicted(windows, theta)[0]) is expected, factor
+    resting = Trajectory(
+        np.where(np.arange(301)[:, None] < 80, inside.observations, inside.observations[80])
+        + 1e-3 * np.random.default_rng(0).standard_normal((301, 1)),
+        inside.actions, inside.dt, channels=inside.channels,
+    )  # fmt: skip
+    windows = bind(Segments(0.2), simulator, Trajectories.stack([resting]))
+    predicted = np.where(windows.observed, windows.measured, 0.0)
+    predicted += 2e-3 * np.random.default_rng(1).standard_normal(predicted.shape)
+    assert follows(windows, predicted)  # of most windows only noise is left, which nothing follows
     followed = OutsidePrior(1 / 40, "log", "angle", 1.0, followed=True)
     assert followed.alarm
     assert followed.finding.severity is Severity.CAUTION
