@@ -18,7 +18,7 @@ from sipe_bayes.diagnostics.records import LogReport
 from sipe_bayes.likelihood.wild_samples import WILD, jumps
 
 _EVEN, _FEWEST = 0.95, 10  # share of a slower sensor's samples that are as far apart as usual; and how many it has
-_ROUNDED = 1e-9  # of a period: less jitter is how stamps are written
+_ROUNDED = 1e-6  # of a period: less jitter is how stamps are written
 _SILENT = 10.0  # periods of a command after its last one: a stream that has stopped, and no late message
 
 
@@ -156,5 +156,4 @@ def _jitter(time: FloatArray) -> float:
     periods = np.diff(time)
     median = np.median(periods)
     jitter = float(np.abs(periods - median * np.maximum(1.0, np.round(periods / median))).max())
-    rounded = max(_ROUNDED * float(median), 8 * np.finfo(float).eps * float(np.abs(time).max()))
-    return jitter if jitter > rounded else 0.0
+    return jitter if jitter > _ROUNDED * float(median) else 0.0
