@@ -185,7 +185,7 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, Any]:
     silent = [row for row in wrong if not row["alarm"]]
     if silent:
         out["wrong, without an alarm"] = shares(silent)
-    doubted = [row for row in wrong if row["alarm"] and row.get("blocking")]
+    doubted = [row for row in wrong if row["alarm"] and row["blocking"]]
     if doubted:
         out["wrong, with an alarm, the fit itself blocked"] = shares(doubted) | {
             "blocking": sorted({code for row in doubted for code in row["blocking"]})

@@ -148,6 +148,6 @@ def run_discovery(
 
         try:
             discovery = summarise(problem, structures, name, chosen, began, tell)
+            return write_discovery(replace(discovery, run=record, out=str(folder)), structures, problem, folder)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(structures.so_far) from None
-        return write_discovery(replace(discovery, run=record, out=str(folder)), structures, problem, folder)

@@ -18,7 +18,7 @@ from sipe_bayes.diagnostics.records import LogReport
 from sipe_bayes.likelihood.wild_samples import WILD, jumps
 
 _EVEN, _FEWEST = 0.95, 10  # share of a slower sensor's samples that are as far apart as usual; and how many it has
-_ROUNDED = 1e-6  # of a period: less jitter is how stamps are written
+_ROUNDED = 1e-6  # of a period: less is how times near zero are rounded
 _SILENT = 10.0  # periods of a command after its last one: a stream that has stopped, and no late message
 
 

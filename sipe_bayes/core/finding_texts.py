@@ -263,7 +263,7 @@ class Code(Enum):
     )
     MISFIT = caution(_NOT_NOISE + "; do not trust the intervals' width: {remedy}", "model lacks something")
     MISFIT_SHIFTS = caution(
-        _NOT_NOISE + "; with it in the model the estimate would move, {moved}: {remedy}", "model lacks something"
+        _NOT_NOISE + "; with {which} in the model the estimate would move, {moved}: {remedy}", "model lacks something"
     )
     NOISE_DRIFTS = caution(
         "what is taken for noise of {channels} has a correlation time as long as the logs ({tau:.2g} s): mostly "

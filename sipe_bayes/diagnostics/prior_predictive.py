@@ -146,8 +146,8 @@ def follows(windows: Windows, predicted: FloatArray) -> bool:
     """Whether simulations bend as the logs do, in every channel: with a wrong unit or sign they do not.
 
     What a straight line in time leaves of the median window is compared with what it leaves of the difference: a start
-    that is slightly off leaves such a line. Windows in which a channel rests, as one that is only pushed now and then,
-    do not count for it.
+    that is slightly off leaves such a line. Where it rests in most windows, as what is only pushed now and then, those
+    in which it moves may speak for it, too.
 
     Args:
         windows: of the logs.
@@ -165,8 +165,8 @@ def follows(windows: Windows, predicted: FloatArray) -> bool:
             continue
         bends = np.array(pairs)
         moving = bends[:, 1] >= PREDICTIVE.moving * bends[:, 1].max()  # of what rests noise alone is left
-        left, whole = np.median(bends[moving], axis=0)
-        if not left < THRESHOLDS.followed * whole:
+        medians = (np.median(some, axis=0) for some in (bends, bends[moving]))
+        if not any(left < THRESHOLDS.followed * whole for left, whole in medians):
             return False
     return True
 

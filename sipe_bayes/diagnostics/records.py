@@ -210,7 +210,7 @@ class Misfit:
         shift: for each parameter by how many posterior sds its estimate would move if the model had the cause; empty
             where that cannot be told.
         floor: the least p that the draws of the null can give.
-        alike: how many causes explain about as much, the cause's words naming them all.
+        alike: how many causes the cause's words name, which explain about as much.
     """
 
     p: float
@@ -265,6 +265,7 @@ class Misfit:
             stop=self.stop,
             moved=", ".join(f"{name} by {self.shift[name]:+.2g} sd" for name in self.moved),
             remedy=self.remedy,
+            which="it" if self.alike == 1 else "the first of them",
             far=THRESHOLDS.far_shift,
         )
 

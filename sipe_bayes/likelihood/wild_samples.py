@@ -9,8 +9,8 @@ in a sum of squares as much as thousands of good ones, so such samples are maske
   in the motion: a redescending estimator of two weights, all or nothing (P. Huber 1981, "Robust Statistics", 4.8).
 
 A residual's threshold is one that white noise passes once in 10^8 samples, so that a clean log loses none. Where so
-many would be masked that they are no accidents, none is. Right after a command jumps a residual does too, if the model
-follows it a little sooner or later: that is what tells of delays and gains, and stays.
+many would be masked that they are no accidents, none is. Within ``after`` samples of a jump of a command a residual
+jumps too, if the model follows a little sooner or later: that says something of the model, and stays.
 """
 
 from __future__ import annotations
@@ -120,13 +120,14 @@ def wild_residuals(windows: Windows, residual: FloatArray) -> IntArray:
 
 
 def _commanded(logs: Trajectories) -> BoolArray:
-    """Which samples (B, T + 1) come right after a command jumped, unless it jumps all the time."""
+    """Which samples (B, T + 1) come right after a command jumped; none of a log in which they jump all the time."""
     follows = np.zeros(logs.observations.shape[:2], bool)
     for own, actions, length in zip(follows, logs.actions, logs.length, strict=True):
         for command in actions[:length].T:
             at = jumps(command) + 1  # the first sample with the new one, which moves nothing yet
             for k in at if len(at) <= WILD.most * length else ():
                 own[k + 1 : k + 1 + WILD.after] = True
+        own &= own.sum() <= WILD.most * WILD.after * length
     return follows
 
 

@@ -123,7 +123,7 @@ def doubt(calibration: Calibration) -> str | None:
 def _use(
     parameters: Sequence[ParameterSummary], findings: Findings, bands: BandCoverage | None, better: bool
 ) -> Verdict:
-    """What a model that lacks something may be used for; better: than the model as given, on held-out logs."""
+    """What a model that lacks something may be used for; better: no held-out log shows that it does not."""
     tones = {p.name: parameter_verdict(p, findings).tone for p in parameters}
     usable, open_ = [n for n, tone in tones.items() if tone != "bad"], [n for n, tone in tones.items() if tone == "bad"]
     text = "It does not tell how well it predicts"
@@ -164,7 +164,7 @@ def headline(
         findings: about them.
         bands: what those of the held-out logs hold.
         brief: the first of the doubts, without its remedy, where all of them stand beside it.
-        better: whether held-out logs do not speak against it as a prediction.
+        better: False where held-out logs show it worse than the model as given, or not better.
     """
     wanted = [p for p in parameters if not p.nuisance]
     if not wanted:

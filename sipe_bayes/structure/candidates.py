@@ -91,6 +91,8 @@ def promised(
 
     The other arguments are those of ``candidates``.
     """
+    if not change.any():
+        return 0.0
     linearisation = windows.linearise(theta, starts)
     around = _Around(windows, theta, starts, noise, prior, linearisation.residual, linearisation.jacobian)
     plain, with_it = (around.fitted(c) for c in (np.zeros((*change.shape, 0)), change[..., None]))

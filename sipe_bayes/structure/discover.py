@@ -119,16 +119,15 @@ def discover(
         enough = search.enough([]) / search.options.plain_share
         state = load_state(checkpoint, DiscoverState, fingerprint).with_budget(search.budget, enough)
     saved = -_SAVE_SECONDS
-    while not state.done:
-        before = state
-        try:
-            state = search.step(state)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(Structures(search, state).so_far) from None  # who is told need not wait for the end
-        if checkpoint is not None and (state.done or time.monotonic() - saved > _SAVE_SECONDS):
-            save_state(checkpoint, before if state.cut else state, fingerprint)  # a larger budget takes that step anew
-            saved = time.monotonic()
-    search.place(state)
+    try:
+        while not state.done:
+            before, state = state, search.step(state)
+            if checkpoint is not None and (state.done or time.monotonic() - saved > _SAVE_SECONDS):
+                save_state(checkpoint, before if state.cut else state, fingerprint)  # larger budgets take it anew
+                saved = time.monotonic()
+        search.place(state)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(Structures(search, state).so_far) from None  # who is told need not wait for the end
     return Structures(search, state)
 
 

@@ -236,11 +236,10 @@ class StructureSearch:
     def _shorter_steps(self, state: DiscoverState) -> DiscoverState:
         """The present structure in shorter physics steps, which may be all, if they promise half of what they must."""
         here, labels = state.here, self._ladder.finer(state.present) or ()
-        least = self.options.step_share * state.promised
+        price, least = self.options.step_gain, self.options.step_share * state.promised
         gain, rollouts = self.fitting.step_gain(self.structure(here.labels), self.structure(labels), here)
         state = replace(state, rank_rollouts=state.rank_rollouts + rollouts)
-        worth = gain > 0.5 * max(self.price(labels[-1]), least)
-        fitted = self._fitted(state, labels, here.theta) if worth else state
+        fitted = self._fitted(state, labels, here.theta) if gain > 0.5 * max(price, least) else state
         one = fitted.of(labels)
         if one is None or not self.better(one, here) or one.evidence - here.evidence < least:
             return replace(fitted, phase=Phase.FIT)
@@ -384,6 +383,7 @@ class StructureSearch:
 
     def _fitted(self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray) -> DiscoverState:
         left, cut = self._left(state), None
+        self._rollouts, self._fit_rollouts = state.rollouts, 0
         try:
             most = self.enough(labels)
             cut = state.phase if left < most else None

@@ -85,8 +85,9 @@ class Structures:
         count = f"{len(self.fitted)} structures fitted" if len(self.fitted) > 1 else "the model as it is fitted"
         if not self.state.present:
             return f"{count}, nothing kept so far"
-        here, sizes = self.state.here, []
-        own = [parameter for piece in self.placed(here) for parameter in piece.parameters]
+        here, sizes, placed = self.state.here, [], self.search.placed
+        known = all(label in placed for label in here.labels)  # not before a search that goes on has begun
+        own = [parameter for piece in self.placed(here) for parameter in piece.parameters] if known else []
         for parameter, theta in zip(own, here.theta[len(here.theta) - len(own) :], strict=True):
             sizes.append(f"{parameter.targets[0]} {float(parameter.value(theta)):.3g} {parameter.unit}".rstrip())
         kept = " + ".join(here.labels) + (f" ({', '.join(sizes)})" if sizes else "")

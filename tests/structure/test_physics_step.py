@@ -272,5 +272,6 @@ def test_what_shorter_steps_promise_is_about_what_they_gain(truth: float, least:
     one = fitting.fit(pieces, plain.theta, 2000)
     print(gain, one.evidence - plain.evidence)
     assert rollouts > 2
+    assert fitting.step_gain([], [], plain)[0] == 0.0  # nothing changes
     assert least <= gain < most
     assert 0.4 * gain - 1 < max(one.evidence - plain.evidence, 0.0) < 2.5 * gain + 1

@@ -136,7 +136,7 @@ def _zeros(readings: Sequence[Reading]) -> list[Unknown]:
 
 
 def springs(model: mujoco.MjModel, machine: Machine, readings: Sequence[Reading], sizes: Sizes) -> list[Unknown]:
-    """Springs that the model lacks at joints that move: not asked for, but left out of a fit they look like delays."""
+    """Springs that the model lacks at joints that move: left out of a fit they look like delays."""
     measured = {r.match.target for r in readings if not r.commanded}
     joints = [j for j in machine.joints if f"joint:{j.name}.position" in measured and not j.base]
     joints += _follow(model, machine, joints)

@@ -16,7 +16,8 @@ from sipe_bayes.core.arrays import FloatArray
 
 RELATIVE = "no force is known, so that all others are relative to it; weigh it and write it into the model"
 """Why a mass is left out."""
-_NOTABLE = 0.03  # of its range, from which a spring is told
+_NOTABLE = 0.03  # of its range, from which a spring is asked for
+_STILL = 0.1  # rad or m, the least motion within which one may rest
 MOST = 30
 """Parameters that are asked for: what shows and is left out is in all others."""
 _WEAK = 3.0  # of the noise, what a parameter has to move over its range
@@ -126,12 +127,15 @@ def sprung(
         value, target = spring.low + fit.theta[k] * (spring.high - spring.low), spring.targets[0]
         joint = model.joint(target.removeprefix("joint:").removesuffix(".stiffness"))
         places = [*states[:, 1 + int(joint.qposadr[0])], float(model.qpos_spring[joint.qposadr[0]])]
-        low, high = (float(f"{x:.2g}") for x in (min(places), max(places)))
-        about = f"a spring that the model does not have, about {value:.2g}"
+        size = 10.0 ** (np.floor(np.log10(max(np.ptp(places), _STILL))) - 1)
+        first, last = np.floor(min(places) / size), 1 + np.floor(max(places) / size)
+        low, high = float(f"{size * first:.6g}"), float(f"{size * last:.6g}")
+        where = "where it rests, between the ends of the motion; one that is preloaded rests beyond"
+        about = f"{spring.note}, about {value:.2g}"
         rest = f"joint:{joint.name}.springref"
         asked += [
-            replace(spring, high=rounded_up(spring.high), note=about),
-            Unknown(f"{spring.name}_rest", (rest,), low, high, False, "where it rests, between the ends of the motion"),
+            roomy(model, replace(spring, high=rounded_up(spring.high), note=about), float(fit.theta[k])),
+            Unknown(f"{spring.name}_rest", (rest,), low, high, False, where),
         ]
         said.append(
             f"a spring of about {value:.2g} in SI seems to act where the model has none: {target!r} and {rest!r} are "
