@@ -182,10 +182,12 @@ def headline(
     good = [p.name for p in wanted if parameter_verdict(p, findings).tone == "good"]
     if not good:
         return Verdict("bad", "No value may be trusted within its interval; the table says why.")
+    unasked = bool(findings.of(Code.MISFIT_NOT_ASKED))
+    if_right = ", if the model lacks nothing" if unasked else ""
     if len(good) == len(wanted):
         text = f"All {len(good)} values may be trusted within their intervals" if len(good) > 1 else _ONE
-        return Verdict("good", f"{text}.")
-    text = f"{len(good)} of {len(wanted)} values may be trusted within their intervals: {_few(good)}"
+        return Verdict("fair" if unasked else "good", f"{text}{if_right}.")
+    text = f"{len(good)} of {len(wanted)} values may be trusted within their intervals{if_right}: {_few(good)}"
     return Verdict("fair", f"{text}; the table says why not the others.")
 
 

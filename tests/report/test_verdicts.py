@@ -211,6 +211,10 @@ def test_headline_counts_without_nuisance_parameters() -> None:
     assert seen(good, weak, nuisance).text == words
     assert seen(good, good).text == "All 2 values may be trusted within their intervals."
     assert seen(good).tone == "good"
+    impacts = Findings([noticed(Code.MISFIT_NOT_ASKED, severity=Severity.NOTE)])
+    words = "All 2 values may be trusted within their intervals, if the model lacks nothing."
+    assert judged.headline([good, good], impacts) == judged.Verdict("fair", words)
+    assert "intervals, if the model lacks nothing: mass;" in judged.headline([good, weak], impacts).text
     assert seen(weak, weak).tone == "bad"
     assert seen(nuisance).tone == "fair"
     doubts = Findings(doubt(text) for text in ("the chains have not mixed", "another", "a third"))
