@@ -146,7 +146,7 @@ def follows(windows: Windows, predicted: FloatArray) -> bool:
     """Whether simulations bend as the logs do, in every channel: with a wrong unit or sign they do not.
 
     What a straight line in time leaves of the median window is compared with what it leaves of the difference: a start
-    that is slightly off leaves such a line. Where it rests in most windows, as what is only pushed now and then, those
+    that is slightly off leaves such a line. A channel may rest in most windows, as what is only pushed now and then: those
     in which it moves may speak for it, too.
 
     Args:

@@ -96,10 +96,10 @@ def test_an_interruption_says_what_there_is(
     with pytest.raises(SystemExit) as left:
         main()
     assert left.value.code == 130
-    said = capsys.readouterr().err
+    errors = capsys.readouterr().err
     size = r"\(joint:hinge.frictionloss 0.1\d* N m\)"
-    assert re.search(rf"interrupted: \d+ structures fitted, kept so far dry_friction:hinge {size}, \d\d+ nats", said)
-    assert said.rstrip().endswith("over the model as it was; the same command goes on")
+    assert re.search(rf"interrupted: \d+ structures fitted, kept so far dry_friction:hinge {size}, \d\d+ nats", errors)
+    assert errors.rstrip().endswith("over the model as it was; the same command goes on")
 
 
 def _interrupted(*_: object) -> None:

@@ -119,7 +119,7 @@ def sprung(
         fit: with the effects of each.
         states: (n, S) of the logs: a spring rests where its joint has been.
     """
-    asked, said = [], []
+    asked, remarks = [], []
     for k, spring in enumerate(beside, len(unknowns)):
         shown = fit.jacobian[:, k] * fit.theta[k] / np.sqrt(max(1.0, len(fit.jacobian) / 400.0))
         if not (float(np.linalg.norm(shown)) > _CLEAR and fit.theta[k] > _NOTABLE):
@@ -137,8 +137,8 @@ def sprung(
             roomy(model, replace(spring, high=rounded_up(spring.high), note=about), float(fit.theta[k])),
             Unknown(f"{spring.name}_rest", (rest,), low, high, False, where),
         ]
-        said.append(
+        remarks.append(
             f"a spring of about {value:.2g} in SI seems to act where the model has none: {target!r} and {rest!r} are "
             "asked for; take them out if there is none, and look for what pulls instead"
         )
-    return asked, said
+    return asked, remarks
