@@ -146,8 +146,8 @@ def follows(windows: Windows, predicted: FloatArray) -> bool:
     """Whether simulations bend as the logs do, in every channel: with a wrong unit or sign they do not.
 
     What a straight line in time leaves of the median window is compared with what it leaves of the difference: a start
-    that is slightly off leaves such a line. A channel may rest in most windows, as what is only pushed now and then: those
-    in which it moves may speak for it, too.
+    that is slightly off leaves such a line. A channel may rest in most windows, as what is only pushed now and then:
+    those in which it moves may speak for it, too.
 
     Args:
         windows: of the logs.
