@@ -25,7 +25,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -154,7 +154,7 @@ def printed(row: dict[str, Any]) -> FloatArray:
     return np.stack([np.minimum(plain_ends[0], lacking[0]), np.maximum(plain_ends[1], lacking[1])])
 
 
-def shares(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def shares(rows: list[dict[str, Any]], kinds: Sequence[str] = KINDS) -> dict[str, Any]:
     """Coverage, its standard error by fit, and the median width in the range; how much wider the printed ones are."""
     times = np.concatenate(
         [np.diff(printed(row), axis=0)[0] / np.diff(row["ends"]["plain"], axis=0)[0] for row in rows]
@@ -165,7 +165,7 @@ def shares(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "mean": round(float(times.mean()), 3),
         "most": round(float(times.max()), 3),
     }
-    for kind in KINDS:
+    for kind in kinds:
         inside, widths = [], []
         for row in rows:
             low, high = printed(row) if kind == "printed" else np.array(row["ends"][kind])

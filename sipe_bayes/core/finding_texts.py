@@ -270,7 +270,7 @@ class Code(Enum):
         "changes from sample to sample were fitted, hardly where the motion goes"
     )
     MISFIT_NOT_ASKED = note(
-        "whether the residuals are noise is not asked: through impacts no linearisation says what other physics does"
+        "whether the residuals are noise is not asked: the model follows too few windows through impacts, or slips"
     )
     NOISE_FREE = note(
         "the model explains the logs but for {share:.0e} of what they move, as where they were simulated without "
@@ -278,7 +278,7 @@ class Code(Enum):
     )
     MISFIT_UNKNOWN = caution("whether the residuals are noise is unknown: {reason}")
     UNTOLD = note("these logs can not tell {causes}; then values are off by more than the sd that they have: {moved}")
-    CHECKS_THINNED = note("of the fit's {windows} windows {asked}, spread evenly, were asked what the model lacks")
+    CHECKS_THINNED = note("of the fit's {windows} windows {asked}, {chosen}, were asked what the model lacks")
     RESIDUALS_LEFT_OUT = note(
         "Residuals, and whether they are noise: with likelihood = 'state_space' the state is unknown at every sample, "
         "and process noise, which is inferred, takes what the model lacks. Errors and signals are over windows from "

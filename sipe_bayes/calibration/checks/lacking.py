@@ -16,12 +16,15 @@ from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.evaluate import fitted_residuals
+from sipe_bayes.diagnostics.misfit.followed_windows import AskedWindows, followed_windows
 from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics, spread_alone
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.misfit.tolerances import tolerance_findings, untold
 from sipe_bayes.diagnostics.records import Misfit, Residual
 from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.inference.random_effects import LogEstimate
 from sipe_bayes.inference.recorded import Tell
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
@@ -112,22 +115,45 @@ def _probed(
     """The logs as the checks of their residuals see them; unknown: gets findings of what they cannot tell."""
     if isinstance(problem.likelihood, StateSpace):
         return None
-    windows, theta, noise, starts = fit.windows, fit.theta, fit.noise, fit.starts
-    if {Code.SCATTER, Code.SCATTER_UNKNOWN, Code.SLIPS} & {item.code for item in method.findings}:
-        unknown.append(finding(Code.MISFIT_NOT_ASKED))
-        return None
-    left = float(np.max(noise.sd / np.maximum(windows.spread, np.finfo(float).tiny)))
+    left = float(np.max(fit.noise.sd / np.maximum(fit.windows.spread, np.finfo(float).tiny)))
     if left < THRESHOLDS.rounding:
         unknown.append(finding(Code.NOISE_FREE, share=left))
         return None
     try:
-        prior = QuadraticPrior.of(problem.prior)
-        probed = ProbedLogs(windows, theta, noise, starts, prior, fit.lin, tell, kept)
-        if probed.windows.num_windows < windows.num_windows:
-            asked = probed.windows.num_windows
-            unknown.append(finding(Code.CHECKS_THINNED, asked=asked, windows=windows.num_windows))
+        asked = asked_windows(method, fit, problem.prior)
+        if asked is None:
+            unknown.append(finding(Code.MISFIT_NOT_ASKED))
+            return None
+        probed = ProbedLogs(asked.windows, asked.theta, asked.noise, asked.starts, asked.prior, asked.lin, tell, kept)
+        count, of = probed.windows.num_windows, fit.windows.num_windows
+        if count < of:
+            chosen = "that the model follows through impacts" if grows(fit.windows) else "spread evenly"
+            unknown.append(finding(Code.CHECKS_THINNED, asked=count, windows=of, chosen=chosen))
         unknown.extend(tolerance_findings(probed, untold(probed, problem.tolerances)))
     except ValueError as error:  # LinAlgError is one
         unknown.append(finding(Code.MISFIT_UNKNOWN, reason=error))
         return None
     return probed
+
+
+def asked_windows(method: Estimator, fit: Fit, believed: Posterior) -> AskedWindows | None:
+    """The windows whose residuals are asked what the model lacks.
+
+    Args:
+        method: that fitted them.
+        fit: all windows.
+        believed: prior of the fit.
+
+    Returns:
+        Through impacts those that the model follows; None where they are too few, or where the model slips.
+    """
+    prior = QuadraticPrior.of(believed)
+    if not grows(fit.windows):
+        return AskedWindows(fit.windows, fit.theta, fit.starts, fit.noise, prior, fit.lin)
+    if {Code.SCATTER_UNKNOWN, Code.SLIPS} & {item.code for item in method.findings}:
+        return None
+    theta = method.optimum if isinstance(method, Laplace) else None
+    starts = None if theta is None or not isinstance(method, Laplace) else method.fitted_starts(theta)
+    if theta is None or starts is None:
+        theta, starts = fit.theta, fit.starts
+    return followed_windows(AskedWindows(fit.windows, theta, starts, fit.noise, prior, None))

@@ -196,7 +196,7 @@ class Laplace(Estimator[LaplaceState]):
         kept = distinct(search.optima)
         probe = probed(self.problem, windows, kept)
         if probe.stands:
-            return replace(ended, search=_looked_around(search, kept[0]))
+            return replace(ended, search=search.looked_around(kept[0]))
         state = replace(ended, search=search, draws=probe.draws, given=probe.given, unjudged=not probe.judged)
         return replace(state, done=probe.draws is None or not windows.has_room(draw_size(self.problem, windows, kept)))
 
@@ -354,13 +354,13 @@ class Laplace(Estimator[LaplaceState]):
 
         Beyond a shorter log's end they stay where they are.
         """
-        kept = [] if self.state is None else distinct(self.state.search.optima)
-        if not kept or not isinstance(kept[0], ChainOptimum):
+        best = self._best
+        if not isinstance(best, ChainOptimum):
             return None
         length = trajectories.length
         ends = np.cumsum(length + 1)
         sample = np.minimum(np.arange(int(length.max()) + 1), length[:, None])
-        return np.asarray(kept[0].states[(ends - length - 1)[:, None] + sample])
+        return np.asarray(best.states[(ends - length - 1)[:, None] + sample])
 
     @property
     def wild(self) -> IntArray:
@@ -370,31 +370,28 @@ class Laplace(Estimator[LaplaceState]):
 
     def fitted_starts(self, theta: FloatArray) -> FloatArray | None:
         """Starts (W, D) of the windows of ``fit`` as the best optimum has them at theta (N,); of a chain None."""
-        kept = [] if self.state is None else distinct(self.state.search.optima)
-        if not kept or not isinstance(kept[0], WindowOptimum):
+        best = self._best
+        if not isinstance(best, WindowOptimum):
             return None
-        return np.asarray(kept[0].starts - kept[0].slope @ (theta - kept[0].theta))
+        return np.asarray(best.starts - best.slope @ (theta - best.theta))
+
+    @property
+    def optimum(self) -> FloatArray | None:
+        """Theta (N,) of the best optimum of ``fit``; through impacts the posterior may lie elsewhere."""
+        return None if self._best is None else self._best.theta
+
+    @property
+    def _best(self) -> Optimum | None:
+        kept = [] if self.state is None else distinct(self.state.search.optima)
+        return kept[0] if kept else None
 
     def information(self) -> tuple[FloatArray, FloatArray]:
         """Optimum (N,), perhaps outside the cube, and information (N, N) of the data alone, after ``fit``."""
-        kept = [] if self.state is None else distinct(self.state.search.optima)
-        if not kept:
+        if self._best is None:
             raise ValueError("information: nothing has been fitted yet; call fit first")
-        prior, mean, total = QuadraticPrior.of(self.prior), kept[0].centre, np.linalg.inv(kept[0].spread)
+        prior, mean, total = QuadraticPrior.of(self.prior), self._best.centre, np.linalg.inv(self._best.spread)
         flat = FLAT_PRECISION * np.eye(len(mean))
         eigenvalues, axes = np.linalg.eigh(total - prior.precision - flat)
         information = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T
         right = total @ mean - prior.precision @ prior.mean - flat @ np.full(len(mean), 0.5)
         return np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ right, information  # else a direction is open
-
-
-def _looked_around(search: WindowState, optimum: Optimum) -> WindowState:
-    """The search where an optimum's normal stands: its budget left no room for a look around, and this was one."""
-    if (
-        not isinstance(optimum, WindowOptimum)
-        or optimum.finding is None
-        or optimum.finding.code is not Code.NOT_LOOKED_AROUND
-    ):
-        return search
-    optima = tuple(replace(one, finding=None) if one is optimum else one for one in search.optima)
-    return replace(search, optima=optima)

@@ -185,3 +185,12 @@ class WindowState(StrategyState[Position]):
             if (left < np.maximum(1.0, 0.1 * whole)).all():
                 return True
         return False
+
+    def looked_around(self, optimum: Optimum) -> WindowState:
+        """Where an optimum's normal stands: its budget left no room for a look around, and this was one."""
+        if not isinstance(optimum, WindowOptimum) or optimum.finding is None:
+            return self
+        if optimum.finding.code is not Code.NOT_LOOKED_AROUND:
+            return self
+        optima = tuple(replace(one, finding=None) if one is optimum else one for one in self.optima)
+        return replace(self, optima=optima)
