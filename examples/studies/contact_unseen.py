@@ -124,19 +124,12 @@ def clean(simulator: sipe.Simulator, name: str, theta: FloatArray, seed: int, st
     return simulator.rollout(theta, actions, simulator.default_state(), dt=contact.DT)[0]
 
 
-def in_their_place() -> list[str]:
-    """Put these machines in the place of those of ``contact.py``; returns their names."""
-    contact.UNKNOWN, contact.JOINTS, contact.MOTORS = UNKNOWN, JOINTS, MOTORS
-    return list(UNKNOWN)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--machines", nargs="+", default=list(UNKNOWN), choices=list(UNKNOWN))
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), default=[0, 10])
     given = parser.parse_args()
-    contact.clean = clean
-    in_their_place()
+    contact.UNKNOWN, contact.JOINTS, contact.MOTORS, contact.clean = UNKNOWN, JOINTS, MOTORS, clean
     file = RUNS / "fits.jsonl"
     for seed, name in product(range(*given.seeds), given.machines):
         which = {"model": name, "level": LEVEL, "steps": STEPS, "seed": seed}

@@ -198,13 +198,17 @@ class Windows:
             setattr(view, name, getattr(self, name)[:, : steps + 1])
         return view._in_order()
 
-    def part(self, keep: IntArray) -> Windows:
-        """Some of the windows, by number. Their rollouts are counted by themselves, as if all were simulated."""
+    def part(self, keep: IntArray, observed: BoolArray | None = None) -> Windows:
+        """Some of the windows, by number. Their rollouts are counted by themselves, as if all were simulated.
+
+        observed: (K, L, C) of their samples those that count.
+        """
         view = copy.copy(self)
         for name in _BY_WINDOW:
             setattr(view, name, getattr(self, name)[keep])
         view.goals = None if self.goals is None else self.goals[keep]
         view.names = [self.names[w] for w in keep]
+        view.observed = view.observed if observed is None else observed
         return view._in_order()
 
     def _in_order(self) -> Windows:

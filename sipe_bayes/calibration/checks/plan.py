@@ -15,6 +15,7 @@ from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.diagnostics.agreement import LOG_BUDGET
 from sipe_bayes.diagnostics.evaluate import band_cost, starts_cost
 from sipe_bayes.diagnostics.identifiability import GRID
+from sipe_bayes.diagnostics.misfit.followed_windows import followed_cost
 from sipe_bayes.diagnostics.prior_predictive import PREDICTIVE
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace, LaplaceState
@@ -145,7 +146,7 @@ def plan_of(problem: Problem, method: Estimator) -> Plan:
     most = {
         Check.STARTS: 0 if known else 2 * search,
         Check.LOGS: (0 if chain else lin) + LOG_BUDGET * logs if logs > 1 and not grows(windows) else 0,
-        Check.LACKING: lacking if chain else lacking + lin + logs,
+        Check.LACKING: lacking if chain else lacking + (followed_cost(windows) if grows(windows) else lin + logs),
         Check.PREDICTIONS: 2 * (logs + held),
         Check.COMPARISON: 2 * search * (logs + held) // logs,
         Check.PRIOR: PREDICTIVE.simulations * logs,
