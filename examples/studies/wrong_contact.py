@@ -4,10 +4,11 @@
     python examples/studies/wrong_contact.py --seeds 0        # the tables of what there is
 
 The machines of ``contact_unseen.py`` and four more (a lever under a sprung flap, a plunger that knocks a block, a
-carriage on a beam between stops, a leg that kicks a cart), fitted by windows: six logs of 200 control steps of 8 ms with commands of their
-own, truths in .2 to .8 of their ranges, noise of .5 % of each channel's spread. Planted at a joint, of a tenth of the
-joint's usual force: friction under load, a delay of two samples, dry friction that differs by direction, dry friction;
-and nothing. Each is fitted twice, with the library as it is and without the planted extension in it (``unknown``).
+carriage on a beam between stops, a leg that kicks a cart), fitted by windows: six logs of 200 control steps of 8 ms
+with commands of their own, truths in .2 to .8 of their ranges, noise of .5 % of each channel's spread. Planted at a
+joint, of a tenth of the joint's usual force: friction under load, a delay of two samples, dry friction that differs by
+direction, dry friction; and nothing. Each is fitted twice, with the library as it is and without the planted extension
+in it (``unknown``).
 
 What the model lacks is asked of the windows that it follows (``diagnostics/misfit/followed_windows.py``). That was made
 with six of these machines, ``MADE_WITH``; for the others nothing was changed.

@@ -199,10 +199,7 @@ class Windows:
         return view._in_order()
 
     def part(self, keep: IntArray, observed: BoolArray | None = None) -> Windows:
-        """Some of the windows, by number. Their rollouts are counted by themselves, as if all were simulated.
-
-        observed: (K, L, C) of their samples those that count.
-        """
+        """Some of the windows, and samples (K, L, C) of theirs. Their rollouts are counted as if all were simulated."""
         view = copy.copy(self)
         for name in _BY_WINDOW:
             setattr(view, name, getattr(self, name)[keep])
