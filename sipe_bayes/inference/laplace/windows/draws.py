@@ -3,7 +3,8 @@
 Each optimum's normal is probed two sds along each parameter's direction (``importance.is_normal``), where starts are
 estimated only if it leaves one open, and that of a single one looked beyond (``inference.stretches``). Where all
 stand and nothing lies beyond, they are the posterior, shared by their evidence. Optima with hardly any mass are left
-out of this, and several are not asked about where starts are estimated, which follow one optimum alone.
+out of this, and several are not asked about where starts are estimated, which follow one optimum alone; nor is one
+through impacts whose normal is that of scattered groups: it does not stand for the likelihood.
 
 The first batches come from each optimum's normal, widened, and from a normal along each stretch; the later ones from
 normals with the moments of what was drawn around an optimum (``importance.draw``).
@@ -77,7 +78,7 @@ def probed(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) ->
     best, tuning, n = kept[0], problem.options.tuning.importance, len(problem.space)
     if not tuning.wanted:
         return Probe()
-    if not isinstance(best, WindowOptimum) or best.guessed or windows.settings.noise == "sandwich":
+    if not isinstance(best, WindowOptimum) or best.guessed or best.scatters or windows.settings.noise == "sandwich":
         return Probe()
     shared = sharing(kept, problem)
     if len(shared) > 1 and windows.num_start:

@@ -143,6 +143,11 @@ class WindowOptimum(Optimum):
         return self.finding is not None and self.finding.code is Code.NOT_SMOOTH
 
     @property
+    def scatters(self) -> bool:
+        """Whether its normal is that of the scatter of groups of windows, not of the likelihood."""
+        return self.finding is not None and self.finding.code is Code.SCATTER
+
+    @property
     def unexplained(self) -> bool:
         """Whether simulations leave more there than the noise of known starts."""
         return self.finding is not None and self.finding.code is Code.BEYOND_START_NOISE
