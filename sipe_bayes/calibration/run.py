@@ -42,6 +42,7 @@ from sipe_bayes.diagnostics.records import Mixing
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.envs.unknowns import bounded_by_nature
 from sipe_bayes.inference.base import Estimator
+from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.inference.recorded import Progress, digest
 from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.likelihood.binding import bind
@@ -90,7 +91,7 @@ def calibrate(
         *(look.finding for look in (*outside.logs, misfit) if look is not None and look.alarm),
         *problem.findings,
         *unmeasured_starts(problem.simulator, logs, problem.likelihood, problem.holdout is not None),
-        *_own(problem, method, posterior, misfit is not None),
+        *_own(problem, method, posterior, misfit is not None and not grows(fit.windows)),
         *(finding(Code.AGREEMENT_UNKNOWN, log=name) for name in alone.skipped),
         *lacks.findings,
         *(() if Findings(lacks.findings).of(Code.NOISE_FREE) else drifting(fit.channel_noise())),
@@ -155,7 +156,7 @@ def _mixing(method: Estimator) -> Mixing | None:
 def _own(problem: Problem, method: Estimator, posterior: Posterior, asked: bool) -> list[Finding]:
     """What the estimator noticed itself, and what its edge may be; bounds are told by parameter, with their values.
 
-    asked: whether what the model lacks is asked for, so that nothing else need say that a channel is not followed.
+    asked: whether what the model lacks is asked of all windows, so that nothing else need say what is not followed.
     """
     elsewhere = {Code.AT_BOUND, Code.NOISE_EXCEEDS_SCATTER} if asked else {Code.AT_BOUND}
     spread = [] if method.uncertain else [finding(Code.SEARCH_SPREAD, method=method.name)]

@@ -182,6 +182,10 @@ ADVICE: dict[Code, str] = {
         '`noise.model = "white"`, whose fit follows the motion itself.'
     ),
     Code.MISFIT_NOT_ASKED: "Judge by the held-out logs.",
+    Code.WINDOWS_NOT_FOLLOWED: (
+        "Through impacts that the model misses no linearisation says what other physics does; what only these would "
+        "show is not seen. Judge by the held-out logs."
+    ),
     Code.NOISE_FREE: "Nothing to do. A log from a machine has noise: add some before you judge what a log would tell.",
     Code.MISFIT_UNKNOWN: "Judge by the residuals in the report and by the held-out logs.",
     Code.UNTOLD: (

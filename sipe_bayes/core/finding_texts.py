@@ -266,11 +266,12 @@ class Code(Enum):
         _NOT_NOISE + "; with {which} in the model the estimate would move, {moved}: {remedy}", "model lacks something"
     )
     NOISE_DRIFTS = caution(
-        "what is taken for noise of {channels} has a correlation time as long as the logs ({tau:.2g} s): mostly "
-        "changes from sample to sample were fitted, hardly where the motion goes"
+        "noise of {channels} has a correlation time as long as the logs ({tau:.2g} s): mostly changes from sample to "
+        "sample were fitted, hardly where the motion goes"
     )
-    MISFIT_NOT_ASKED = note(
-        "whether the residuals are noise is not asked: the model follows too few windows through impacts, or slips"
+    MISFIT_NOT_ASKED = note("whether the residuals are noise is not asked: the model follows too few windows, or slips")
+    WINDOWS_NOT_FOLLOWED = note(
+        "only {followed} of {windows} windows, which the model follows, were asked what it lacks"
     )
     NOISE_FREE = note(
         "the model explains the logs but for {share:.0e} of what they move, as where they were simulated without "
@@ -278,7 +279,7 @@ class Code(Enum):
     )
     MISFIT_UNKNOWN = caution("whether the residuals are noise is unknown: {reason}")
     UNTOLD = note("these logs can not tell {causes}; then values are off by more than the sd that they have: {moved}")
-    CHECKS_THINNED = note("of the fit's {windows} windows {asked}, {chosen}, were asked what the model lacks")
+    CHECKS_THINNED = note("of the fit's {windows} windows {asked}, spread evenly, were asked what the model lacks")
     RESIDUALS_LEFT_OUT = note(
         "Residuals, and whether they are noise: with likelihood = 'state_space' the state is unknown at every sample, "
         "and process noise, which is inferred, takes what the model lacks. Errors and signals are over windows from "
@@ -292,9 +293,7 @@ class Code(Enum):
         "{count} of {steps} control steps stand out and count for little, as where a contact is missed: at {times}."
     )
     PROCESS_NOISE_SMALL = note("The model follows the logs closely{elsewhere}.")
-    PROCESS_NOISE_LARGE = note(
-        "A model that lacks nothing needs next to none: look for what it lacks there before you trust the values."
-    )
+    PROCESS_NOISE_LARGE = note("A model that lacks nothing needs next to none: look for what it lacks there first.")
 
     # logs
     WITHIN_PRIOR = note("log {log} is like simulations of the prior ({p})")

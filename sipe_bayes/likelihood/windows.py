@@ -206,6 +206,7 @@ class Windows:
         view.goals = None if self.goals is None else self.goals[keep]
         view.names = [self.names[w] for w in keep]
         view.observed = view.observed if observed is None else observed
+        view._subset, view._masked = None, 0
         return view._in_order()
 
     def _in_order(self) -> Windows:

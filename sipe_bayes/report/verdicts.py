@@ -182,7 +182,7 @@ def headline(
     good = [p.name for p in wanted if parameter_verdict(p, findings).tone == "good"]
     if not good:
         return Verdict("bad", "No value may be trusted within its interval; the table says why.")
-    unasked = bool(findings.of(Code.MISFIT_NOT_ASKED))
+    unasked = bool(findings.of(Code.MISFIT_NOT_ASKED, Code.WINDOWS_NOT_FOLLOWED))
     if_right = ", if the model lacks nothing" if unasked else ""
     if len(good) == len(wanted):
         text = f"All {len(good)} values may be trusted within their intervals" if len(good) > 1 else _ONE
@@ -247,7 +247,7 @@ def lack(calibration: Calibration) -> Verdict | None:
     """What the model lacks, where that matters; the warnings say more."""
     misfit = calibration.misfit
     if misfit is None and any(f.code is Code.MISFIT_NOT_ASKED for f in calibration.findings):
-        return Verdict("fair", "Whether the model lacks something was not asked: the fit goes through impacts.")
+        return Verdict("fair", "Whether the model lacks something was not asked: it follows too few windows, or slips.")
     if misfit is None or not misfit.alarm:
         return None
     share = f"{number(100 * misfit.share[misfit.channel], 2)} % of the residual of {misfit.channel}"

@@ -16,7 +16,7 @@ from sipe_bayes.core.findings import Code, finding
 def test_what_a_run_found(tmp_path: Path) -> None:
     """With the run's own numbers, the worst first, each code once."""
     found = [
-        finding(Code.CHECKS_THINNED, windows=84, asked=67, chosen="spread evenly"),
+        finding(Code.CHECKS_THINNED, windows=84, asked=67),
         finding(Code.NOT_SMOOTH, gain=12.34),
         finding(Code.NOT_SMOOTH, gain=5.0),
     ]

@@ -197,7 +197,7 @@ def test_what_the_model_lacks_says_where_values_would_be(calibration: Calibratio
     assert tied.text.endswith("tries it.")
     impacts = dataclasses.replace(calibration, findings=(noticed(Code.MISFIT_NOT_ASKED, severity=Severity.NOTE),))
     assert judged.lack(impacts) == judged.Verdict(
-        "fair", "Whether the model lacks something was not asked: the fit goes through impacts."
+        "fair", "Whether the model lacks something was not asked: it follows too few windows, or slips."
     )
 
 
@@ -211,9 +211,10 @@ def test_headline_counts_without_nuisance_parameters() -> None:
     assert seen(good, weak, nuisance).text == words
     assert seen(good, good).text == "All 2 values may be trusted within their intervals."
     assert seen(good).tone == "good"
-    impacts = Findings([noticed(Code.MISFIT_NOT_ASKED, severity=Severity.NOTE)])
     words = "All 2 values may be trusted within their intervals, if the model lacks nothing."
-    assert judged.headline([good, good], impacts) == judged.Verdict("fair", words)
+    for code in (Code.WINDOWS_NOT_FOLLOWED, Code.MISFIT_NOT_ASKED):
+        impacts = Findings([noticed(code, severity=Severity.NOTE)])
+        assert judged.headline([good, good], impacts) == judged.Verdict("fair", words)
     assert "intervals, if the model lacks nothing: mass;" in judged.headline([good, weak], impacts).text
     assert seen(weak, weak).tone == "bad"
     assert seen(nuisance).tone == "fair"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,7 @@ from sipe_bayes.inference.random_effects import LogEstimate
 from sipe_bayes.inference.recorded import Tell
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Particles, Posterior
 
 
@@ -92,7 +93,7 @@ def lacking(
         probed = _probed(problem, method, fit, unknown, tell, kept)
         chain = isinstance(problem.likelihood, StateSpace)
         residuals = [] if chain else fitted_residuals(fit.windows, fit.theta, fit.noise, fit.starts)
-        looks = None if probed is None else misfit(probed, posterior.stddev.numpy(), method.seed)
+        looks = None if probed is None else misfit(probed, posterior.stddev.numpy(), method.seed, estimate=fit.theta)
         tell("intervals with it")
         given = problem.prior, conflict or (looks is not None and looks.alarm), method.seed
         if probed is None:
@@ -120,20 +121,27 @@ def _probed(
         unknown.append(finding(Code.NOISE_FREE, share=left))
         return None
     try:
+        tell("windows that the model follows")
         asked = asked_windows(method, fit, problem.prior)
         if asked is None:
             unknown.append(finding(Code.MISFIT_NOT_ASKED))
             return None
         probed = ProbedLogs(asked.windows, asked.theta, asked.noise, asked.starts, asked.prior, asked.lin, tell, kept)
-        count, of = probed.windows.num_windows, fit.windows.num_windows
-        if count < of:
-            chosen = "that the model follows through impacts" if grows(fit.windows) else "spread evenly"
-            unknown.append(finding(Code.CHECKS_THINNED, asked=count, windows=of, chosen=chosen))
+        unknown.extend(_left_out(fit.windows, asked, probed.windows))
         unknown.extend(tolerance_findings(probed, untold(probed, problem.tolerances)))
     except ValueError as error:  # LinAlgError is one
         unknown.append(finding(Code.MISFIT_UNKNOWN, reason=error))
         return None
     return probed
+
+
+def _left_out(every: Windows, asked: AskedWindows, probed: Windows) -> Iterator[Finding]:
+    """Of how many windows it was asked."""
+    followed, looks = asked.windows.num_windows, asked.among
+    if looks < every.num_windows or probed.num_windows < followed:
+        yield finding(Code.CHECKS_THINNED, asked=min(looks, probed.num_windows), windows=every.num_windows)
+    if followed < THRESHOLDS.asked * looks:
+        yield finding(Code.WINDOWS_NOT_FOLLOWED, followed=followed, windows=looks)
 
 
 def asked_windows(method: Estimator, fit: Fit, believed: Posterior) -> AskedWindows | None:
@@ -149,11 +157,11 @@ def asked_windows(method: Estimator, fit: Fit, believed: Posterior) -> AskedWind
     """
     prior = QuadraticPrior.of(believed)
     if not grows(fit.windows):
-        return AskedWindows(fit.windows, fit.theta, fit.starts, fit.noise, prior, fit.lin)
+        return AskedWindows(fit.windows, fit.theta, fit.starts, fit.noise, prior, fit.lin, fit.windows.num_windows)
     if {Code.SCATTER_UNKNOWN, Code.SLIPS} & {item.code for item in method.findings}:
         return None
     theta = method.optimum if isinstance(method, Laplace) else None
     starts = None if theta is None or not isinstance(method, Laplace) else method.fitted_starts(theta)
     if theta is None or starts is None:
         theta, starts = fit.theta, fit.starts
-    return followed_windows(AskedWindows(fit.windows, theta, starts, fit.noise, prior, None))
+    return followed_windows(AskedWindows(fit.windows, theta, starts, fit.noise, prior, None, fit.windows.num_windows))

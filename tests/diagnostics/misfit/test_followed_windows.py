@@ -64,7 +64,9 @@ def asked(logs: Trajectories, theta: np.ndarray = TRUTH) -> AskedWindows:
     simulator, white = machine(), Noise(NOISE, np.zeros(2))
     windows = Windows(Segments(0.2, "white"), simulator, logs)
     starts = best_starts(windows, theta, white)
-    return AskedWindows(windows, theta, starts, white, QuadraticPrior.of(prior(simulator.space)), None)
+    return AskedWindows(
+        windows, theta, starts, white, QuadraticPrior.of(prior(simulator.space)), None, windows.num_windows
+    )
 
 
 def changed(logs: Trajectories, samples: list[tuple[int, slice, float]]) -> Trajectories:
@@ -80,7 +82,7 @@ def test_what_is_not_followed_is_left_out_and_theta_goes_where_the_others_are() 
     whole = asked(logs, TRUTH + np.array([0.03, -0.03]))
     clean = followed_windows(whole)
     assert clean is not None
-    assert clean.windows.num_windows == whole.windows.num_windows == 24
+    assert clean.windows.num_windows >= 22  # of 24; in one or two simulations jump
     np.testing.assert_allclose(clean.theta, TRUTH, atol=0.04)  # sds of .013 and .017
     # windows that another motion fills, and one sample
     spoiled = changed(logs, [(0, slice(28, 40), 0.02), (2, slice(68, 80), 0.02), (3, slice(50, 51), 0.0025)])
@@ -88,8 +90,9 @@ def test_what_is_not_followed_is_left_out_and_theta_goes_where_the_others_are() 
     some = followed_windows(replace(given, noise=Noise(10 * NOISE, np.zeros(2))))
     assert some is not None
     kept = {(int(log), int(start)) for log, start in zip(some.windows.log, some.windows.start, strict=True)}
-    every = {(int(log), int(start)) for log, start in zip(whole.windows.log, whole.windows.start, strict=True)}
-    assert every - kept == {(0, 20), (2, 60)}
+    before = {(int(log), int(start)) for log, start in zip(clean.windows.log, clean.windows.start, strict=True)}
+    assert {(0, 20), (2, 60)} <= before - kept
+    assert len(before - kept) <= 4  # where theta is a little off, simulations jump in others
     spoiled_one = int(np.flatnonzero((some.windows.log == 3) & (some.windows.start == 40))[0])
     assert np.argwhere(~some.windows.observed[spoiled_one, 1:20]).tolist() == [[9, 1]]
     np.testing.assert_allclose(some.noise.sd, NOISE, rtol=0.1)
@@ -98,7 +101,7 @@ def test_what_is_not_followed_is_left_out_and_theta_goes_where_the_others_are() 
 
 def test_noise_alone_seldom_leaves_a_window_out() -> None:
     """The chance is 5 %; of 20 seeds 5 or more would be once in 400."""
-    least = FollowedOptions(rounds=1, far=6.0)
+    least = FollowedOptions(rounds=1, far=6.0, differs=1e9)
     out = 0
     for seed in range(20):
         logs = recorded(seed=seed)
@@ -108,10 +111,37 @@ def test_noise_alone_seldom_leaves_a_window_out() -> None:
     assert out < 5
 
 
+def test_windows_where_simulations_jump_are_left_out() -> None:
+    """Where steps of 3e-3 give other slopes than those of a linearisation; all else is followed."""
+    given = asked(recorded())
+    windows, starts = given.windows, given.starts
+    some = followed_windows(given, FollowedOptions(rounds=1, far=6.0, wider=3e-3))
+    assert some is not None
+    kept = {(int(log), int(start)) for log, start in zip(some.windows.log, some.windows.start, strict=True)}
+    both = (windows.linearise(TRUTH, starts, with_starts=False, theta_step=step) for step in (None, 3e-3))
+    short, wide = (lin.jacobian / NOISE[:, None] for lin in both)
+    apart, larger = (np.linalg.norm(x, axis=(1, 2)) for x in (short - wide, np.maximum(abs(short), abs(wide))))
+    jumps = ((apart > 0.5 * larger) & (apart > 1)).any(1)
+    own = {(int(log), int(start)) for log, start in zip(windows.log[~jumps], windows.start[~jumps], strict=True)}
+    assert 0 < jumps.sum() < 4
+    assert kept == own
+
+
 def test_few_windows_say_nothing() -> None:
     given = asked(recorded(count=1))
-    assert followed_windows(given, FollowedOptions(fewest=7)) is None
-    assert followed_windows(given, FollowedOptions(fewest=6)) is not None
+    assert followed_windows(given, FollowedOptions(fewest=7, differs=1e9)) is None
+    assert followed_windows(given, FollowedOptions(fewest=6, differs=1e9)) is not None
+
+
+def test_a_channel_that_no_followed_window_has_leaves_nothing_to_ask() -> None:
+    logs = recorded()
+    observations = logs.observations.copy()
+    observations[1:, :, 1] = np.nan
+    some = followed_windows(asked(replace(logs, observations=observations)))
+    assert some is not None
+    assert np.isfinite(some.noise.sd).all()
+    observations[0, :, 0] += 0.02 * np.sign(np.sin(np.arange(121)))  # the ram of the only log that has the block
+    assert followed_windows(asked(replace(logs, observations=observations))) is None
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.2])
