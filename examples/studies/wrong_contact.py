@@ -42,7 +42,6 @@ from sipe_bayes.core.findings import Severity
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
-from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.likelihood.binding import bind
@@ -140,7 +139,7 @@ def fitted(name: str, effect: str, seed: int) -> Iterator[dict[str, Any]]:
             with mock.patch(  # not by name: the physics step is asked of, too
                 "sipe_bayes.structure.probes.EXTENSIONS", library
             ):
-                probed = ProbedLogs(asked.windows, asked.theta, asked.noise, asked.starts, asked.prior, asked.lin)
+                probed = asked.probed()
             seen = misfit(probed, posterior.stddev.numpy(), seed, estimate=theta)
             missing = missing_physics(probed, posterior, method.prior, seen.alarm, seed)
         yield {

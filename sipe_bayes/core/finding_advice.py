@@ -7,7 +7,10 @@ import re
 from sipe_bayes.core.finding_texts import Code
 
 _COMPARE = "Fit again with `--estimator mcmc` and compare the intervals."
-_REMEDY_LACKING = "Run `sipe discover` on the same configuration; it puts in what explains the residuals, and says so."
+_REMEDY_LACKING = (
+    "Run `sipe discover` on the same configuration; it puts in what explains the residuals, and says so. Through "
+    "impacts add what is named as parameters, fit again, and compare the held-out errors."
+)
 _BOUNDS = (
     "Widen the bounds if the value could lie beyond. Where the bound is physical, zero friction for instance, the "
     "estimate may be right and its interval one-sided. A value that runs away often stands for physics that the model "
@@ -115,7 +118,10 @@ ADVICE: dict[Code, str] = {
     Code.SCATTER: (
         "Nothing to do: the intervals are themselves uncertain by a third to a fifth. More tosses narrow them."
     ),
-    Code.SCATTER_UNKNOWN: "Record more windows with impacts, and take out parameters that differ between logs.",
+    Code.SCATTER_UNKNOWN: (
+        "Record more logs with impacts, or cut them into shorter windows (`window`); take out parameters that differ "
+        "between logs."
+    ),
     Code.SLIPS: (
         "Use the model to predict, as far as its held-out errors are small. For values, leave out of `parameters` what "
         "trades with others (masses of wheels, a centre of mass that was measured), and see whether the rest stays."

@@ -254,7 +254,7 @@ def lack(calibration: Calibration) -> Verdict | None:
     if not misfit.matters:
         return Verdict("fair", f"The model lacks something small: it looks like {misfit.cause} ({share}).")
     text = f"The model lacks something: it looks like {misfit.cause} ({share}, {misfit.p_text})."
-    text += " `sipe discover` tries it." if misfit.shift else ""
+    text += " `sipe discover` tries it." if misfit.shift and misfit.searchable else ""
     if misfit.alike > 1:  # with which of them values would move is open
         return Verdict("bad", text)
     moved = sorted(misfit.moved, key=lambda name: -abs(misfit.shift[name]))[:_DOUBTS]

@@ -14,6 +14,7 @@ from sipe_bayes.core.checkpoint import load_state, save_state
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import MOST_ROLLOUTS, cores, nearest_name, whole
 from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.inference.recorded import Progress, digest
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
@@ -107,7 +108,8 @@ def discover(
         progress: called along the way.
 
     Raises:
-        ValueError: for a simulator of anything but an MJCF, unknown extensions, or sites that the model does not have.
+        ValueError: for a simulator of anything but an MJCF, unknown extensions, sites that the model does not have, or
+            logs through impacts.
         CheckpointError: for a checkpoint that is damaged or of another run.
         KeyboardInterrupt: with what the search has, in words.
     """
@@ -194,6 +196,12 @@ def _search(
         whole("seed", seed, 0),
         simulator.num_threads or cores(),
     )
+    if grows(fitting.windows(simulator)):
+        raise ValueError(
+            "logs: contacts come and go along them, and through impacts two structures' fits differ by which of these "
+            "they meet, more than by what they hold; add what `sipe calibrate` names as parameters, fit again, and "
+            "compare the held-out errors"
+        )
     most = whole("budget", budget, 1, "rollouts", MOST_ROLLOUTS)
     return StructureSearch(fitting, extensions, restriction.sites, options, most, progress, restriction.finer)
 

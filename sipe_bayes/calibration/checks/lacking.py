@@ -126,7 +126,7 @@ def _probed(
         if asked is None:
             unknown.append(finding(Code.MISFIT_NOT_ASKED))
             return None
-        probed = ProbedLogs(asked.windows, asked.theta, asked.noise, asked.starts, asked.prior, asked.lin, tell, kept)
+        probed = asked.probed(tell, kept)
         unknown.extend(_left_out(fit.windows, asked, probed.windows))
         unknown.extend(tolerance_findings(probed, untold(probed, problem.tolerances)))
     except ValueError as error:  # LinAlgError is one

@@ -33,13 +33,15 @@ import numpy as np
 import scipy.stats
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
+from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
 from sipe_bayes.core.options import Options, option
-from sipe_bayes.diagnostics.misfit.probed_logs import MISFIT
+from sipe_bayes.diagnostics.misfit.probed_logs import MISFIT, ProbedLogs
 from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule, descend
 from sipe_bayes.inference.laplace.options import GrowingTuning
 from sipe_bayes.inference.laplace.windows.energy import WindowEnergy, WindowPoint, updated_noise
-from sipe_bayes.inference.laplace.windows.growing_windows import ManyStarts
+from sipe_bayes.inference.laplace.windows.growing_windows import ManyStarts, grows
+from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.noise import NORMAL_MAD, Noise, coefficients
 from sipe_bayes.likelihood.quadratic_prior import UNIFORM_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.windows import Linearisation, Windows
@@ -88,6 +90,18 @@ class AskedWindows:
     prior: QuadraticPrior
     lin: Linearisation | None
     among: int
+
+    def probed(self, tell: Tell = silent, kept: Kept = NOTHING_KEPT) -> ProbedLogs:
+        """With what extensions would do to them; of what follows impacts, noise may be larger for a while.
+
+        Args:
+            tell: called with what is being done.
+            kept: keeps what extensions do, and draws of the null.
+        """
+        steady = not grows(self.windows)
+        return ProbedLogs(
+            self.windows, self.theta, self.noise, self.starts, self.prior, self.lin, tell, kept, steady=steady
+        )
 
 
 def followed_cost(windows: Windows) -> int:

@@ -27,7 +27,8 @@ Deviations:
   estimates.
 - Probes are of a user's MJCF; of other environments only whiteness is asked, which slow misfit passes as slow noise.
 - Of windows through impacts samples and windows that lie far off were left out (``misfit.followed_windows``), of the
-  draws of the null none are: p is too large there by as little as noise alone lies so far.
+  draws of the null none are: p is too large there by as little as noise alone lies so far. Whether noise is larger for
+  a while is not asked there: what is left of an impact is, also where the model is right.
 - Where dry friction holds the simulated joint still, a small step of what acts on it changes nothing, and says nothing.
 - Where a probe's own statistic is beyond the null and the probe explains a tenth of the residual, it is named even if
   whiteness is odder, since it says more. Causes whose statistics are about as large are named together; one that is
@@ -44,6 +45,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.misfit.probed_logs import MISFIT, ProbedLogs, Solved, lags, oddness
 from sipe_bayes.diagnostics.records import Misfit
+from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.structure.probes import Probe
 
 
@@ -111,8 +113,9 @@ class _Named:
         causes = self._alike(probe, seen)
         cause, remedy = " or ".join(c.name for c in causes), " or ".join(c.remedy for c in causes)
         moves = dict(zip(names, shift.tolist(), strict=True))
-        named = self._placed(p, cause, f"{remedy}; or run sipe discover", gains, share, moves)
-        return replace(named, alike=len(causes))
+        searchable = not grows(logs.windows)
+        named = self._placed(p, cause, remedy + "; or run sipe discover" * searchable, gains, share, moves)
+        return replace(named, alike=len(causes), searchable=searchable)
 
     def _alike(self, probe: int, seen: Solved) -> list[Probe]:
         """The best probe and those of other causes that explain about as much, best first."""

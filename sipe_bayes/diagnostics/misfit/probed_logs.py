@@ -116,6 +116,7 @@ class ProbedLogs:
         tell: called with what is being done.
         kept: keeps what extensions do, and draws of the null.
         extensions: that are probed; default all that the registry has.
+        steady: whether it is asked if noise is larger for a while.
 
     Raises:
         ValueError: where the simulation diverges at theta.
@@ -132,6 +133,7 @@ class ProbedLogs:
         tell: Tell = silent,
         kept: Kept = NOTHING_KEPT,
         extensions: Sequence[Extension] | None = None,
+        steady: bool = True,
     ) -> None:
         some = spread_windows(windows, MISFIT.steps)
         if len(some) < windows.num_windows:
@@ -139,7 +141,7 @@ class ProbedLogs:
             lin = None if lin is None else Linearisation(lin.residual[some], lin.jacobian[some], lin.valid)
         starts = best_starts(windows, theta, noise) if starts is None else starts
         prior = QuadraticPrior(theta, np.zeros((len(theta), len(theta)))) if prior is None else prior
-        self.windows, self.theta, self.noise = windows, theta, noise
+        self.windows, self.theta, self.noise, self.steady = windows, theta, noise, steady
         self.starts = starts
         linearisation = lin or windows.linearise(theta, starts)
         if not linearisation.valid:
@@ -274,11 +276,13 @@ class ProbedLogs:
         return Solved(statistics, left, step, gradient, information, two_sided, cross, np.diag(inverse))
 
     def whiteness(self, residual: FloatArray, noise: Noise) -> FloatArray:
-        """Cube roots (2 C,) of what a residual (W, L, C) has of autocorrelation, and of its largest mean squares."""
-        white = self.white(residual, noise)
-        pieces = [
-            max((float((p**2).mean()) for p in np.array_split(z, MISFIT.pieces) if len(p)), default=0.0) for z in white
-        ]
+        """Cube roots (2 C,) of what a residual (W, L, C) has of autocorrelation, and of its largest mean squares.
+
+        These are none where they are not asked.
+        """
+        white, parts = self.white(residual, noise), MISFIT.pieces if self.steady else 0
+        split = [np.array_split(z, parts) if parts else [] for z in white]
+        pieces = [max((float((p**2).mean()) for p in own if len(p)), default=0.0) for own in split]
         return np.cbrt(np.array([autocorrelation(z) for z in white] + pieces))
 
     def left(self, residual: FloatArray, step: FloatArray, starts: FloatArray) -> FloatArray:

@@ -16,7 +16,6 @@ from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.diagnostics.misfit.followed_windows import AskedWindows, FollowedOptions, followed_windows
 from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
-from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.likelihood.noise import Noise
@@ -149,11 +148,13 @@ def test_what_is_missing_is_seen_through_impacts(friction: float) -> None:
     """Both ways: the plain estimate of the damping is far off, the interval with what is missing holds it."""
     some = followed_windows(asked(recorded(friction)))
     assert some is not None
-    probed = ProbedLogs(some.windows, some.theta, some.noise, some.starts, some.prior, some.lin)
+    probed = some.probed()
     believed = prior(machine().space)
     sd = np.sqrt(probed.seen.variance)
     looks = misfit(probed, sd)
     assert looks.alarm == (friction > 0)
+    assert not looks.searchable
+    assert "sipe discover" not in looks.remedy
     plain = GaussianMixture([0.0], (some.theta + probed.seen.step[:2])[None], np.diag(sd**2)[None], believed.space)
     missing = missing_physics(probed, plain, believed, looks.alarm)
     assert missing is not None
