@@ -201,10 +201,9 @@ def _slopes(trial: Trial, assumption: Assumption, points: dict[int, _Point], bes
     flights += [base.moved(simulator, here.starts + _START_STEP * row) for row in np.eye(free)]
     measured, seen = base.measured, trial.seen(flights, np.stack(thetas))
     at, count = list(points).index(best), len(points)
-    size = np.maximum(
-        spread_of(trial.bent(measured - seen[at : at + 1]))[0], _LEAST * spread_of(trial.bent(measured[None]))[0]
-    )
-    scaled = np.nan_to_num((measured - seen) / np.maximum(size, 1e-12), nan=_LOST, posinf=_LOST, neginf=-_LOST)
+    least = np.maximum(_LEAST * spread_of(trial.bent(measured[None]))[0], 1e-12)  # of what rests, without noise, none
+    size = np.maximum(spread_of(trial.bent(measured - seen[at : at + 1]))[0], least)
+    scaled = np.nan_to_num((measured - seen) / size, nan=_LOST, posinf=_LOST, neginf=-_LOST)
     flat = np.clip(scaled, -_LOST, _LOST).reshape(len(seen), len(measured), -1)
     by_theta = (flat[count : count + n] - flat[at]) / (signs * _STEP)[:, None, None]
     by_start = np.moveaxis((flat[count + n :] - flat[at]) / _START_STEP, 0, 2)

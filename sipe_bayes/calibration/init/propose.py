@@ -51,7 +51,7 @@ from sipe_bayes.envs.internal.closed_chains import dependent_joints
 from sipe_bayes.envs.internal.resting import resting_joints
 from sipe_bayes.envs.poses import has_pose, is_round
 from sipe_bayes.inference.recorded import Tell, silent
-from sipe_bayes.likelihood.starts.estimates import estimate_states
+from sipe_bayes.likelihood.starts.estimates import contacts_of, estimate_states
 
 _PASSED = 300  # states of each log, of which it is looked what they touch
 _LOOKED_AT = 3  # logs that are simulated
@@ -65,6 +65,7 @@ _TURNING = 24  # windows of the fit of what turns freely: contacts take their ti
 _ROUNDS = 20  # of the fit of unknowns: with dry friction and a delay 12 end far from the optimum, at another delay
 _SPARE = 3  # columns that are not used, of which names are told
 _SHORT = 2.0  # s: logs as short are one window each
+_FEW_TOSSES = 8  # through impacts so many windows and a log held out are asked for
 
 
 def propose(
@@ -386,7 +387,8 @@ def _window(machine: Machine, logs: Sequence[Trajectory], trial: Trial) -> tuple
     At most a fifth of a log, so that its held-out quarter is longer.
     """
     durations = [len(log) * log.dt for log in logs]
-    if max(durations) <= _SHORT:
+    few = len(logs) <= _FEW_TOSSES and contacts_of(trial.simulator, logs).change
+    if max(durations) <= _SHORT and not few:
         return "log", "each log as one: they are short"
     swing = trial.length * logs[0].dt / share_of(machine)
     part = _COUPLED if len(machine.joints) > 1 and share_of(machine) < _COUPLED else _SINGLE

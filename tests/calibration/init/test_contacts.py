@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
 
 from sipe_bayes.calibration.init.draft import Unknown
 from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.unknowns.candidates import as_parameters
 from sipe_bayes.calibration.init.unknowns.contacts import nameless
 from sipe_bayes.calibration.init.windows import rough_unknowns
+from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import bind
+from sipe_bayes.simulation.simulator import Simulator
 
 
 def asked(bodies: str, floor: str = "") -> dict[str, Unknown]:
@@ -139,3 +144,27 @@ def test_bounds_hold_the_friction_that_the_model_has() -> None:
     unknowns = asked(rover("", skid='friction=".01" priority="1"'))
     castor = next(u for u in unknowns.values() if u.targets == ("geom:castor.friction",))
     assert castor.low <= 0.01
+
+
+@pytest.mark.parametrize(("gap", "whole"), [(0.04, False), (0.6, True)])
+def test_few_short_logs_through_impacts_are_cut(gap: float, whole: bool, tmp_path: Path) -> None:
+    """Their scatter is of eight windows at least; logs without impacts stay whole."""
+    model = tmp_path / "model.xml"
+    model.write_text(f"""<mujoco><option timestep=".005"/><worldbody>
+<body name="ram"><joint name="ram" type="slide" axis="1 0 0" damping="2"/>
+<geom type="box" size=".05 .05 .05" mass=".8"/></body>
+<body name="block" pos="{0.1 + gap} 0 0"><joint name="block" type="slide" axis="1 0 0" damping="1" stiffness="30"/>
+<geom type="box" size=".05 .05 .05" mass=".5"/></body></worldbody>
+<actuator><motor name="push" joint="ram" gear="4"/></actuator></mujoco>""")
+    damping = Parameter("damping", 1.0, 3.0, targets=("joint:ram.damping",))
+    positions = ["joint:ram.position", "joint:block.position"]
+    simulator = Simulator(MjcfEnvironment.build(model, [damping], ["push"], positions))
+    files = []
+    for k in range(3):
+        clock = 0.01 * np.arange(120)
+        push = np.sin((4 + k) * clock) * np.sin(2.3 * clock + k)
+        seen = simulator.rollout(np.array([[0.5]]), push[None, :, None], simulator.default_state()[None], 0.01)
+        rows = np.column_stack([clock, seen.observations[0][:-1], push])
+        files.append(tmp_path / f"log{k}.csv")
+        np.savetxt(files[-1], rows, delimiter=",", header="time,ram,block,push", comments="")
+    assert (propose(model, files, tmp_path).window == "log") == whole
