@@ -153,7 +153,7 @@ def _clip(calibration: Calibration, problem: Problem) -> Clip:
     label = with_unit(environment.channels[0], environment.channel_units[0])
     settings = problem.segments
     if settings.window is not None:
-        settings = replace(settings, window=max(settings.window, _CLIP_WINDOW), windows=())
+        settings = replace(settings, window=min(max(settings.window, _CLIP_WINDOW), len(log) * log.dt), windows=())
     try:
         shown = motion(problem.simulator, settings, log, theta, 0, label)
     except ValueError as error:
