@@ -36,11 +36,11 @@ from wrong_models import HERE, ends, printed, shares, truth_of
 
 import sipe_bayes as sipe
 from sipe_bayes.calibration.checks.fitted import Fit
-from sipe_bayes.calibration.checks.lacking import asked_windows
+from sipe_bayes.calibration.checks.lacking import asked_windows, groups_apart
 from sipe_bayes.core.files import write_text
 from sipe_bayes.core.findings import Severity
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
+from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics, spread_alone
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
@@ -142,6 +142,8 @@ def fitted(name: str, effect: str, seed: int) -> Iterator[dict[str, Any]]:
                 probed = asked.probed()
             seen = misfit(probed, posterior.stddev.numpy(), seed, estimate=theta)
             missing = missing_physics(probed, posterior, method.prior, seen.alarm, seed)
+        elif groups := groups_apart(method, posterior):
+            missing = spread_alone(groups, method.prior, True, seed)
         yield {
             "machine": name,
             "effect": effect,

@@ -12,7 +12,7 @@ from sipe_bayes.calibration.checks.plan import Check, Checks
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import Kept
-from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.findings import Code, Finding, Findings, finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.evaluate import fitted_residuals
@@ -25,6 +25,7 @@ from sipe_bayes.diagnostics.records import Misfit, Residual
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.windows.growing_windows import grows
+from sipe_bayes.inference.laplace.windows.state import WindowState
 from sipe_bayes.inference.random_effects import LogEstimate
 from sipe_bayes.inference.recorded import Tell
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
@@ -97,7 +98,8 @@ def lacking(
         tell("intervals with it")
         given = problem.prior, conflict or (looks is not None and looks.alarm), method.seed
         if probed is None:
-            missing = spread_alone(alone, *given)
+            groups = groups_apart(method, posterior) if Findings(unknown).of(Code.MISFIT_NOT_ASKED) else []
+            missing = spread_alone(groups, problem.prior, True, method.seed) if groups else spread_alone(alone, *given)
         else:
             missing = missing_physics(probed, posterior, *given, problem.tolerances)
         return Lacking(looks, None if missing is None else _plain(missing), tuple(residuals), tuple(unknown))
@@ -121,7 +123,8 @@ def _probed(
         unknown.append(finding(Code.NOISE_FREE, share=left))
         return None
     try:
-        tell("windows that the model follows")
+        if grows(fit.windows):
+            tell("windows that the model follows")
         asked = asked_windows(method, fit, problem.prior)
         if asked is None:
             unknown.append(finding(Code.MISFIT_NOT_ASKED))
@@ -142,6 +145,20 @@ def _left_out(every: Windows, asked: AskedWindows, probed: Windows) -> Iterator[
         yield finding(Code.CHECKS_THINNED, asked=min(looks, probed.num_windows), windows=every.num_windows)
     if followed < THRESHOLDS.asked * looks:
         yield finding(Code.WINDOWS_NOT_FOLLOWED, followed=followed, windows=looks)
+
+
+def groups_apart(method: Estimator, posterior: Posterior) -> list[LogEstimate]:
+    """What groups of windows say that were fitted apart, where their scatter is the posterior; else none.
+
+    Args:
+        method: after the fit.
+        posterior: of it, which is that of their mean.
+    """
+    search = method.state.search if isinstance(method, Laplace) and method.state is not None else None
+    if not isinstance(search, WindowState) or not Findings(method.findings).of(Code.SCATTER):
+        return []
+    information = np.diag(1 / (len(search.estimates) * np.maximum(posterior.stddev.numpy(), 1e-12) ** 2))
+    return [LogEstimate(f"group {k}", theta, information) for k, theta in enumerate(search.estimates)]
 
 
 def asked_windows(method: Estimator, fit: Fit, believed: Posterior) -> AskedWindows | None:

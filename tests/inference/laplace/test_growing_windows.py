@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sipe_bayes.core.findings import Code, Severity
+from sipe_bayes.calibration.checks.lacking import groups_apart
+from sipe_bayes.core.findings import Code, Findings, Severity
 from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.diagnostics.misfit.missing_physics import spread_alone
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.options import GrowingTuning
 from sipe_bayes.inference.laplace.windows.energy import LinearisedWindows, WindowEnergy, WindowPoint
@@ -208,6 +210,15 @@ def test_a_cube_is_calibrated_through_its_impacts(windows: Windows) -> None:
     assert abs(float(posterior.mean[0]) - 0.5) < 3 * float(posterior.stddev[0])
     assert 1e-4 < float(posterior.stddev[0]) < 0.05
     assert not any(item.severity == "blocking" for item in estimator.findings)
+    groups = groups_apart(estimator, posterior)
+    assert len(groups) == 4
+    apart = spread_alone(groups, estimator.prior, True)
+    assert apart is not None
+    low, high = apart.further.quantile([0.05, 0.95])[:, 0].tolist()
+    assert low < 0.5 < high
+    assert high - low > 3.29 * float(posterior.stddev[0])
+    estimator.findings = Findings()
+    assert groups_apart(estimator, posterior) == []
 
 
 def test_few_windows_say_that_their_intervals_are_not_to_be_trusted(windows: Windows) -> None:
