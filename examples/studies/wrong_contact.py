@@ -1,6 +1,6 @@
 """Do intervals hold through impacts where the model lacks something? Six logs each, plain intervals beside.
 
-    python examples/studies/wrong_contact.py                  # two seeds: three hours of a core
+    python examples/studies/wrong_contact.py                  # two seeds: two hours of a core
     python examples/studies/wrong_contact.py --seeds 0        # the tables of what there is
 
 The machines of ``contact_unseen.py`` and four more (a lever under a sprung flap, a plunger that knocks a block, a
