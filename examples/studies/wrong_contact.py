@@ -11,7 +11,7 @@ direction, dry friction; and nothing. Each is fitted twice, with the library as 
 in it (``unknown``).
 
 What the model lacks is asked of the windows that it follows (``diagnostics/misfit/followed_windows.py``). That was made
-with six of these machines, ``MADE_WITH``; for the others nothing was changed.
+with seven of these machines, ``MADE_WITH``; for the others nothing was changed.
 
 Coverage is that of 90 %
 intervals, pooled over parameters, as ``wrong_models.py`` has them; ``not blocked`` are the fits that no finding blocks.
@@ -53,7 +53,7 @@ from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
 
 EFFECTS = ("null", "load_friction", "delay", "direction_friction", "dry_friction")
-MADE_WITH = ("bumpers", "finger", "hammer", "roller", "scraper", "tray")
+MADE_WITH = ("bumpers", "finger", "hammer", "roller", "scraper", "seesaw", "tray")
 JOINTS = {
     "flap": ("lever", "flap"),
     "plunger": ("rod", "block"),
