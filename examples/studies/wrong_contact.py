@@ -32,7 +32,7 @@ import contact
 import contact_unseen
 import numpy as np
 from _kept import fits, keep
-from wrong_models import HERE, ends, printed, shares, truth_of
+from wrong_models import HERE, ends, planted, printed, shares
 
 import sipe_bayes as sipe
 from sipe_bayes.calibration.checks.fitted import Fit
@@ -42,15 +42,10 @@ from sipe_bayes.core.findings import Severity
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics, spread_alone
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
-from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.windows import Windows
-from sipe_bayes.structure.extension import extended, members, placements
-from sipe_bayes.structure.machine import machine_of
-from sipe_bayes.structure.registry import EXTENSIONS, get_extension
+from sipe_bayes.structure.registry import EXTENSIONS
 
 EFFECTS = ("null", "load_friction", "delay", "direction_friction", "dry_friction")
 MADE_WITH = ("bumpers", "finger", "hammer", "roller", "scraper", "seesaw", "tray")
@@ -97,18 +92,8 @@ def recorded(name: str, effect: str, seed: int) -> tuple[sipe.Simulator, np.ndar
     rng, count = np.random.default_rng([seed, 5]), simulator.environment.num_actions
     truth = rng.uniform(0.2, 0.8, len(simulator.space))
     actions = [contact_unseen.commands(name, 100 * seed + k, STEPS, count) for k in range(LOGS)]
-    engine, theta, start = simulator, truth, simulator.default_state()[None]
-    if effect != "null":
-        quiet = simulator.rollout(truth[None], actions[0][None], start, contact.DT)
-        seen = Trajectories.stack([Trajectory(quiet.observations[0], actions[0], contact.DT, channels=quiet.channels)])
-        windows = Windows(Segments(), simulator, seen)
-        machine = machine_of(windows, truth, windows.no_starts())
-        choices = [p for p in placements(get_extension(effect), machine) if len(members(p.site)) == 1]
-        one = choices[seed % len(choices)]
-        assert isinstance(simulator.environment, MjcfEnvironment)
-        engine = sipe.Simulator(extended(simulator.environment, [one]), num_threads=1)
-        own = [float(p.normalise(v)) for p, v in zip(one.parameters, truth_of(one, machine, SIZE), strict=True)]
-        theta, start = np.concatenate([truth, own]), engine.default_state()[None]
+    engine, theta = planted(simulator, truth, actions[0], contact.DT, effect, seed, SIZE)
+    start = engine.default_state()[None]
     clean = [engine.rollout(theta[None], command[None], start, contact.DT) for command in actions]
     if not all(one.valid.all() for one in clean):
         raise ValueError(f"{name}, {effect}, seed {seed}: the machine's simulation diverges; plant something else")

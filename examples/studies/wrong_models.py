@@ -73,24 +73,32 @@ def truth_of(placed: Placed, machine: Machine, size: float) -> list[float]:
     return values(placed, machine, size)
 
 
+def planted(
+    simulator: sipe.Simulator, truth: FloatArray, command: FloatArray, dt: float, effect: str, seed: int, size: float
+) -> tuple[sipe.Simulator, FloatArray]:
+    """The machine that has an effect, of a size by its motion under a command (T, A), and its theta; or "null"."""
+    if effect == "null":
+        return simulator, truth
+    quiet = simulator.rollout(truth[None], command[None], simulator.default_state()[None], dt)
+    seen = Trajectories.stack([Trajectory(quiet.observations[0], command, dt, channels=quiet.channels)])
+    windows = Windows(Segments(), simulator, seen)
+    machine = machine_of(windows, truth, windows.no_starts())
+    choices = [p for p in placements(get_extension(effect), machine) if len(members(p.site)) == 1]
+    one = choices[seed % len(choices)]
+    assert isinstance(simulator.environment, MjcfEnvironment)
+    own = [float(p.normalise(v)) for p, v in zip(one.parameters, truth_of(one, machine, size), strict=True)]
+    engine = sipe.Simulator(extended(simulator.environment, [one]), num_threads=1)
+    return engine, np.concatenate([truth, own])
+
+
 def recorded(name: str, effect: str, seed: int, size: float) -> tuple[sipe.Simulator, np.ndarray, Trajectories]:
     """The plain model, the truth (N,) in theta, and the logs of a machine that has an effect."""
     simulator = plain(name)
     rng = np.random.default_rng([seed, [*MACHINES].index(name), ("null", *EFFECTS, *MORE).index(effect)])
     actions = [commands(name, rng)[0] * rng.uniform(0.5, 1.3) for _ in range(LOGS)]
     truth = rng.uniform(0.2, 0.8, len(simulator.space))
-    engine, theta, start = simulator, truth, simulator.default_state()[None]
-    if effect != "null":
-        quiet = simulator.rollout(truth[None], actions[0][None], start, DT)
-        seen = Trajectories.stack([Trajectory(quiet.observations[0], actions[0], DT, channels=quiet.channels)])
-        windows = Windows(Segments(), simulator, seen)
-        machine = machine_of(windows, truth, windows.no_starts())
-        choices = [p for p in placements(get_extension(effect), machine) if len(members(p.site)) == 1]
-        one = choices[seed % len(choices)]
-        assert isinstance(simulator.environment, MjcfEnvironment)
-        engine = sipe.Simulator(extended(simulator.environment, [one]), num_threads=1)
-        own = [float(p.normalise(v)) for p, v in zip(one.parameters, truth_of(one, machine, size), strict=True)]
-        theta, start = np.concatenate([truth, own]), engine.default_state()[None]
+    engine, theta = planted(simulator, truth, actions[0], DT, effect, seed, size)
+    start = engine.default_state()[None]
     clean = [engine.rollout(theta[None], command[None], start, DT) for command in actions]
     if not all(one.valid.all() for one in clean):
         raise ValueError(f"{name}, {effect}, seed {seed}: the machine's simulation diverges; plant something else")
