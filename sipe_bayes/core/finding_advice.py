@@ -118,6 +118,9 @@ ADVICE: dict[Code, str] = {
     Code.SCATTER: (
         "Nothing to do: the intervals are themselves uncertain by a third to a fifth. More tosses narrow them."
     ),
+    Code.WINDOWS_LEFT_OUT: (
+        "Nothing to do: the intervals are those of the other windows. Shorter windows lose less to an impact."
+    ),
     Code.SCATTER_UNKNOWN: (
         "Record more logs with impacts, or cut them into shorter windows (`window`); take out parameters that differ "
         "between logs."

@@ -189,6 +189,7 @@ class Code(Enum):
         "impacts make the simulation rough: the intervals are not those of the curvature but of the scatter of "
         "{groups} groups of windows fitted apart ({lost} of them lost)"
     )
+    WINDOWS_LEFT_OUT = note("{left} of {windows} windows tell nothing: the model misses impacts there, or jumps there")
     SCATTER_UNKNOWN = blocking(
         "impacts make the simulation rough, and {windows} windows are too few to see by their scatter how well the "
         "parameters are known: the intervals may be far too narrow; give at least 8, without parameters per log"

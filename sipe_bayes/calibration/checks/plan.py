@@ -15,11 +15,11 @@ from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.diagnostics.agreement import LOG_BUDGET
 from sipe_bayes.diagnostics.evaluate import band_cost, starts_cost
 from sipe_bayes.diagnostics.identifiability import GRID
-from sipe_bayes.diagnostics.misfit.followed_windows import followed_cost
 from sipe_bayes.diagnostics.prior_predictive import PREDICTIVE
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace, LaplaceState
 from sipe_bayes.inference.laplace.forecast import usual_rest, usual_rollouts
+from sipe_bayes.inference.laplace.windows.followed import followed_cost
 from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.inference.laplace.windows.state import WindowState
 from sipe_bayes.inference.progress_bar import ProgressBar
@@ -138,7 +138,7 @@ def plan_of(problem: Problem, method: Estimator) -> Plan:
     chain = isinstance(problem.likelihood, StateSpace)
     known = chain or isinstance(method, Laplace)
     lin = (1 + n + windows.num_start) * logs
-    search = starts_cost(windows)
+    search, chosen = starts_cost(windows), grows(windows) and not known  # which windows are followed
     try:
         lacking = 0 if chain else probes_cost(windows, np.clip(problem.environment.space.default_theta, 0, 1))
     except ValueError:  # the model as given diverges, which the check will say
@@ -146,7 +146,7 @@ def plan_of(problem: Problem, method: Estimator) -> Plan:
     most = {
         Check.STARTS: 0 if known else 2 * search,
         Check.LOGS: (0 if chain else lin) + LOG_BUDGET * logs if logs > 1 and not grows(windows) else 0,
-        Check.LACKING: lacking if chain else lacking + (followed_cost(windows) if grows(windows) else lin + logs),
+        Check.LACKING: lacking if chain else lacking + (followed_cost(windows) if chosen else lin + logs),
         Check.PREDICTIONS: 2 * (logs + held),
         Check.COMPARISON: 2 * search * (logs + held) // logs,
         Check.PRIOR: PREDICTIVE.simulations * logs,

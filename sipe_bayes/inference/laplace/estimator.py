@@ -31,7 +31,7 @@ from sipe_bayes.inference.laplace.windows.draws import draw_size, more, probed, 
 from sipe_bayes.inference.laplace.windows.longer_windows import led_on
 from sipe_bayes.inference.laplace.windows.optimum import not_followed
 from sipe_bayes.inference.laplace.windows.search import WindowSearch
-from sipe_bayes.inference.laplace.windows.state import WindowOptimum, WindowState
+from sipe_bayes.inference.laplace.windows.state import Followed, WindowOptimum, WindowState
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, StateSpace
 from sipe_bayes.likelihood.state_space.chain import Chain
@@ -297,7 +297,8 @@ class Laplace(Estimator[LaplaceState]):
         self._report(kept, state, enough)
         windows = self.bound(trajectories)
         if isinstance(windows, Windows) and isinstance(self.simulator, Simulator):
-            loose = not_followed(windows, kept[0].sd)
+            assert isinstance(kept[0], WindowOptimum)
+            loose = not_followed(windows, kept[0])
             if loose is not None:
                 self.find(Code.NOISE_EXCEEDS_SCATTER, channel=loose[0], ratio=loose[1])
         if state.draws is not None:
@@ -376,9 +377,9 @@ class Laplace(Estimator[LaplaceState]):
         return np.asarray(best.starts - best.slope @ (theta - best.theta))
 
     @property
-    def optimum(self) -> FloatArray | None:
-        """Theta (N,) of the best optimum of ``fit``; through impacts the posterior may lie elsewhere."""
-        return None if self._best is None else self._best.theta
+    def followed(self) -> Followed | None:
+        """Windows of ``fit`` that are followed through impacts; None where that was not asked, or they are few."""
+        return self._best.followed if isinstance(self._best, WindowOptimum) else None
 
     @property
     def _best(self) -> Optimum | None:

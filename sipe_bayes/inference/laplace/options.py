@@ -78,6 +78,25 @@ class GrowingTuning(Options):
 
 
 @dataclass(frozen=True)
+class FollowedTuning(Options):
+    """Which windows count as followed through impacts, and when their optimum is the posterior; see ``followed``."""
+
+    chance: float = option(0.05, "that a right model's noise leaves any window out", above=0)
+    far: float = option(4.0, "from which a sample is left out: noise alone lies there once in 16,000", "sds", above=0)
+    most_far: float = option(0.25, "of a window's samples of a channel: with more it is not followed", above=0, most=1)
+    least: int = option(2, "samples that count in a window, however long they remember", "samples", least=1)
+    wider: float = option(1e-3, "change of theta over which slopes are compared", "of the cube", above=0)
+    differs: float = option(0.5, "of the larger slope, by which the two may differ in a window", above=0)
+    matters: float = option(1.0, "that a parameter moves a window over its range: smaller slopes", "sds", above=0)
+    rounds: int = option(6, "in which windows are chosen; but for the last a step follows each", least=1)
+    settled: float = option(0.1, "that a step has to promise", "nats", above=0)
+    fewest: int = option(4, "followed windows that say something", least=1)
+    share: float = option(0.25, "of the windows that has to be followed: fewer are those that happen to fit", above=0)
+    most: float = option(0.5, "of the windows, from which their optimum may be the posterior", above=0, most=1)
+    apart: float = option(1e-3, "chance of groups as far from that optimum, below which it is not", above=0, most=1)
+
+
+@dataclass(frozen=True)
 class ContactTuning(Options):
     """How starting points are found from beginnings at known states; see ``contact_starts``."""
 
@@ -145,6 +164,7 @@ class LaplaceTuning(Options):
     windows: WindowTuning = option(WindowTuning(), "how the search over windows goes")
     wide: WideDifferenceTuning = option(WideDifferenceTuning(), "differences as long as the posterior is wide")
     growing: GrowingTuning = option(GrowingTuning(), "how windows of bodies that tumble grow")
+    followed: FollowedTuning = option(FollowedTuning(), "of which windows the posterior is through impacts")
     contact: ContactTuning = option(ContactTuning(), "how starting points through contact are found")
     longer: LongerTuning = option(LongerTuning(), "what is tried where starts are not measured and short windows fail")
     scouting: ScoutTuning = option(ScoutTuning(), "how other values that fit as well are looked for")

@@ -4,7 +4,8 @@ Each optimum's normal is probed two sds along each parameter's direction (``impo
 estimated only if it leaves one open, and that of a single one looked beyond (``inference.stretches``). Where all
 stand and nothing lies beyond, they are the posterior, shared by their evidence. Optima with hardly any mass are left
 out of this, and several are not asked about where starts are estimated, which follow one optimum alone; nor is one
-through impacts whose normal is that of scattered groups: it does not stand for the likelihood.
+through impacts whose normal is that of scattered groups, or of the windows that are followed: it does not stand for
+the likelihood of all.
 
 The first batches come from each optimum's normal, widened, and from a normal along each stretch; the later ones from
 normals with the moments of what was drawn around an optimum (``importance.draw``).
@@ -78,7 +79,9 @@ def probed(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) ->
     best, tuning, n = kept[0], problem.options.tuning.importance, len(problem.space)
     if not tuning.wanted:
         return Probe()
-    if not isinstance(best, WindowOptimum) or best.guessed or best.scatters or windows.settings.noise == "sandwich":
+    if not isinstance(best, WindowOptimum) or best.guessed or best.scatters or best.trims:
+        return Probe()
+    if windows.settings.noise == "sandwich":
         return Probe()
     shared = sharing(kept, problem)
     if len(shared) > 1 and windows.num_start:

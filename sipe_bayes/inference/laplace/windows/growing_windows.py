@@ -22,7 +22,8 @@ Through impacts the likelihood has valleys within valleys, each far narrower tha
 to end in the deepest. So the curvature where it ended says little of how well theta is known. Groups of windows are
 fitted apart, each from starts of their own. Where their estimates scatter by more than the curvature says, the
 posterior is a normal half way between their mean and the estimate of all windows together. Its covariance is that of a
-mean of so few (batch means, as Student's t has it), and holds both of these.
+mean of so few (batch means, as Student's t has it), and holds both of these. Of the windows that the model follows far
+more is known: where their own optimum stands (``followed_posterior``), it takes the place of that normal.
 """
 
 from __future__ import annotations
@@ -230,30 +231,36 @@ def scattered(
     """The optimum with the normal that the scatter of estimates (G, N) gives, where the linearisation's is too narrow.
 
     In no direction is it narrower than that: what the logs leave open, every search leaves where it began.
-    Estimates far from the others, whose search was lost, count for nothing while ``tuning.reliable`` are left.
 
     What slips all along (``slips``) is not believed: its jumps steepen every slope, also along a ridge, where all
     groups then stay together, however far off.
     """
     if slips:
         optimum = replace(optimum, finding=finding(Code.SLIPS, groups=len(estimates)))
-    gap = np.abs(estimates - np.median(estimates, axis=0))
-    scale = NORMAL_MAD * np.median(gap, axis=0)
-    kept = estimates[(gap <= tuning.lost * np.maximum(scale, 1e-9)).all(1)]
-    if len(kept) < tuning.reliable:
-        kept = estimates
-    n, freedom = estimates.shape[1], len(kept) - 1
-    covariance = np.atleast_2d(np.cov(kept.T)) / len(kept)
+    mean, covariance, freedom = mean_of_groups(estimates, tuning)
+    n, lost = len(mean), len(estimates) - 1 - freedom
     excess = float(np.trace(np.linalg.solve(optimum.covariance, covariance))) / n
     if excess < tuning.rough:
         return optimum
     if freedom < 2 * n:  # so few say nothing of correlations
         covariance = np.diag(np.diag(covariance))
     covariance = not_below(covariance * freedom / (freedom - 2), optimum.covariance)  # of Student's t
-    half = 0.5 * (kept.mean(0) - optimum.theta)
+    half = 0.5 * (mean - optimum.theta)
     covariance = covariance + np.outer(half, half)
-    reason = optimum.finding if slips else finding(Code.SCATTER, groups=len(estimates), lost=len(estimates) - len(kept))
+    reason = optimum.finding if slips else finding(Code.SCATTER, groups=len(estimates), lost=lost)
     return replace(optimum, mean=optimum.theta + half, covariance=covariance, finding=reason)
+
+
+def mean_of_groups(estimates: FloatArray, tuning: GrowingTuning) -> tuple[FloatArray, FloatArray, int]:
+    """Mean (N,) of the estimates (G, N) of groups, its covariance (N, N) by their scatter, and degrees of freedom.
+
+    Estimates far from the others, whose search was lost, count for nothing while ``tuning.reliable`` are left.
+    """
+    gap = np.abs(estimates - np.median(estimates, axis=0))
+    scale = NORMAL_MAD * np.median(gap, axis=0)
+    kept = estimates[(gap <= tuning.lost * np.maximum(scale, 1e-9)).all(1)]
+    kept = estimates if len(kept) < tuning.reliable else kept
+    return kept.mean(0), np.atleast_2d(np.cov(kept.T)) / len(kept), len(kept) - 1
 
 
 def not_below(covariance: FloatArray, least: FloatArray) -> FloatArray:

@@ -30,6 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -49,6 +50,7 @@ from sipe_bayes.inference.laplace.windows.energy import (
     same_noise,
     updated_noise,
 )
+from sipe_bayes.inference.laplace.windows.followed_posterior import followed_step
 from sipe_bayes.inference.laplace.windows.growing_windows import (
     ManyStarts,
     counted,
@@ -130,6 +132,7 @@ class WindowSearch:
             Phase.ROUGH: self._rough,
             Phase.DESCEND: self._descend,
             Phase.NOISE: self._noise,
+            Phase.FOLLOW: partial(followed_step, self.problem, self.windows),
             Phase.SCOUT: self._scout,
         }
         return phases[state.here.phase](state)
@@ -149,7 +152,8 @@ class WindowSearch:
         if before.group + 1 < count:
             return replace(state, here=self._apart(before.group + 1, state))
         best, slips = max(state.aside, key=lambda one: one.evidence), self.windows.contacts.slips
-        return replace(state, optima=(scattered(best, np.stack(state.estimates), tuning.growing, slips),), done=True)
+        optimum = scattered(best, np.stack(state.estimates), tuning.growing, slips)
+        return replace(state, optima=(optimum,), here=here.following(best), done=slips)
 
     def _next(self, state: WindowState) -> WindowState:
         """At the next starting point; after the last, groups of windows that tumble are fitted apart."""

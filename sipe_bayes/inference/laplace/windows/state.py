@@ -8,11 +8,12 @@ from typing import Self
 
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.findings import Code, Finding
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule
 from sipe_bayes.inference.laplace.strategy import Optimum, StrategyState
 from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.quadratic_prior import UNIFORM_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.windows import Windows
 
 
@@ -31,6 +32,8 @@ class Phase(StrEnum):
     """The noise as it was estimated last."""
     NOISE = auto()
     """The noise is estimated anew before the step."""
+    FOLLOW = auto()
+    """After groups of windows were fitted apart: towards the optimum of those that are followed; see ``followed``."""
     SCOUT = auto()
     """After the last starting point: other values that fit as well; see ``scouting``."""
 
@@ -113,10 +116,46 @@ class Position:
         phase = Phase.ROUGH if self.phase is Phase.ROUGH else Phase.DESCEND
         return replace(self, phase=phase, kept=Kept(), damping=rule.first)
 
+    def following(self, optimum: WindowOptimum) -> Self:
+        """Where the windows that are followed are looked for first: at an optimum of all."""
+        at, noise = replace(self, phase=Phase.FOLLOW, group=None, iteration=0), Noise(optimum.sd, optimum.tau)
+        return replace(at, theta=optimum.theta, starts=optimum.starts, noise=noise, kept=Kept())
+
     @property
     def revisits(self) -> bool:
         """Whether the search goes on from an optimum of this very starting point."""
         return self.patterns > 0
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Windows that are followed, and where.
+
+    Args:
+        counted: (W, L, C) samples that count, none in windows that are not followed.
+        theta: (N,).
+        starts: (W, D), of all windows.
+        noise: (C,) of the samples that count.
+    """
+
+    counted: BoolArray
+    theta: FloatArray
+    starts: FloatArray
+    noise: Noise
+
+    @property
+    def kept(self) -> IntArray:
+        """Numbers (K,) of the windows that are followed."""
+        return np.flatnonzero(self.counted.any((1, 2)))
+
+    def of(self, windows: Windows) -> Windows:
+        """Those of all windows, with nothing observed but what counts."""
+        return windows.part(self.kept, self.counted[self.kept])
+
+    def held(self, prior: QuadraticPrior) -> QuadraticPrior:
+        """A prior beside which theta is held as by a uniform one where it stands, with the same pull there."""
+        precision = prior.precision + UNIFORM_PRECISION * np.eye(len(self.theta))
+        return QuadraticPrior(self.theta + np.linalg.solve(precision, prior.pull(self.theta)), precision)
 
 
 @dataclass(frozen=True)
@@ -129,6 +168,7 @@ class WindowOptimum(Optimum):
         guessed: whether the normal's width is only a guess.
         heavier: whether places that the normal all but excludes fit nearly as well.
         finding: why its intervals are not to be trusted; None where they may be.
+        followed: windows that are followed through impacts, and where; None where that was not asked, or they are few.
     """
 
     starts: FloatArray
@@ -136,6 +176,7 @@ class WindowOptimum(Optimum):
     guessed: bool = False
     heavier: bool = False
     finding: Finding | None = None
+    followed: Followed | None = None
 
     @property
     def unsmooth(self) -> bool:
@@ -146,6 +187,16 @@ class WindowOptimum(Optimum):
     def scatters(self) -> bool:
         """Whether its normal is that of the scatter of groups of windows, not of the likelihood."""
         return self.finding is not None and self.finding.code is Code.SCATTER
+
+    @property
+    def trims(self) -> bool:
+        """Whether its normal is that of the windows that are followed."""
+        return self.followed is not None and bool((self.followed.theta == self.theta).all())
+
+    @property
+    def judged_sd(self) -> FloatArray:
+        """Noise (C,) that says whether the fit follows the logs: of the windows that its normal is of."""
+        return self.sd if self.followed is None or not self.trims else self.followed.noise.sd
 
     @property
     def unexplained(self) -> bool:

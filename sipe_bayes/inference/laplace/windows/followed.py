@@ -1,0 +1,208 @@
+r"""Windows that a model follows through impacts: of these alone it is known what the parameters are, and what it lacks.
+
+An impact that the simulation misses, or meets a little late, leaves more than any missing physics would, also where the
+model is right: between two valleys of the likelihood no slope leads, and in some windows every search ends in the wrong
+one. What is left there says nothing of the model, and it draws the estimate to where the other windows fit less well.
+But most windows are followed, and around their own optimum they change as smoothly as their slopes say.
+
+So theta is moved to the optimum of the windows that are followed, as in least trimmed squares (P. Rousseeuw, "Least
+median of squares regression", 1984, https://doi.org/10.1080/01621459.1984.10477105): choose them, take a step with
+their starts, let the other windows' starts follow, choose again.
+
+Samples that lie far from the others, by robust sds of their channel, are those of an impact that is met a little
+late, or of a body that chatters where it lies; they are left out, and the windows where they are many. Noise that lets
+the samples of a channel follow one another as :math:`\rho` leaves, for the mean of their squares, of n samples
+
+.. math:: n' = n (1 - \rho^2) / (1 + \rho^2)
+
+that count (G. Bayley, J. Hammersley, "The 'effective' number of independent observations in an autocorrelated time
+series", 1946, https://doi.org/10.2307/2983560), and mean squares that are about chi-square with n' degrees of freedom.
+A window is followed where no channel's mean square is larger than the largest of all windows and channels would be by
+chance. Nor is one whose slopes over short changes of theta are not those over wider ones: there simulations jump, and
+one such window would hold theta anywhere.
+
+What moves parameters that only the other windows tell is then not known: on the way theta is held by as much as a
+uniform prior would, around where it stands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.stats
+
+from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule, Descent, descend
+from sipe_bayes.inference.laplace.options import FollowedTuning, GrowingTuning
+from sipe_bayes.inference.laplace.windows.energy import WindowEnergy, WindowPoint, updated_noise
+from sipe_bayes.inference.laplace.windows.growing_windows import ManyStarts
+from sipe_bayes.inference.laplace.windows.state import Followed
+from sipe_bayes.likelihood.noise import NORMAL_MAD, Noise, coefficients
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.likelihood.windows import Linearisation, Windows
+
+FOLLOWED, _SHARES, _RULE = FollowedTuning(), GrowingTuning().shares, DampingRule()
+
+
+@dataclass(frozen=True)
+class FollowedLook:
+    """What is followed at a point, and the linearisation there.
+
+    Args:
+        at: that.
+        windows: those that are followed.
+        lin: of them.
+        every: of all windows.
+    """
+
+    at: Followed
+    windows: Windows
+    lin: Linearisation
+    every: Linearisation
+
+
+def followed_cost(windows: Windows, tuning: FollowedTuning = FOLLOWED) -> int:
+    """Rollouts of ``followed_windows`` as a rule, where no step is refused."""
+    each = 1 + 2 * windows.num_theta + windows.num_start + 2 * len(_SHARES)
+    return tuning.rounds * each * len(windows.trajectories)
+
+
+def followed_windows(
+    windows: Windows,
+    theta: FloatArray,
+    starts: FloatArray,
+    noise: Noise,
+    prior: QuadraticPrior,
+    tuning: FollowedTuning = FOLLOWED,
+) -> FollowedLook | None:
+    """Those of some windows that the model follows, with the noise that they have by themselves, at their own optimum.
+
+    Costs up to ``tuning.rounds`` linearisations.
+
+    Args:
+        windows: from which they are chosen.
+        theta: (N,) an optimum of all.
+        starts: (W, D) there.
+        noise: (C,) there.
+        prior: of theta.
+        tuning: which count as followed.
+
+    Returns:
+        None where there are too few to say anything, or where they leave a channel out.
+    """
+    look = followed_at(windows, theta, starts, noise, prior, tuning)
+    for _ in range(tuning.rounds - 1):
+        step = None if look is None else onward(windows, look, prior, tuning)
+        if look is None or step is None:
+            return look
+        look = followed_at(windows, step.theta, step.starts, look.at.noise, prior, tuning)
+    return look
+
+
+def followed_at(
+    windows: Windows,
+    theta: FloatArray,
+    starts: FloatArray,
+    noise: Noise,
+    prior: QuadraticPrior,
+    tuning: FollowedTuning = FOLLOWED,
+) -> FollowedLook | None:
+    """Those that are followed at theta (N,) and starts (W, D); else as ``followed_windows``."""
+    lin = windows.linearise(theta, starts)
+    if not lin.valid:
+        return None
+    counted, sd = _counted(windows, lin.residual, noise.tau, tuning)
+    counted &= _smooth(windows, lin, theta, starts, sd, tuning)[:, None, None]
+    at = Followed(counted, theta, starts, Noise(sd, noise.tau))
+    if len(at.kept) < max(tuning.fewest, tuning.share * windows.num_windows):
+        return None
+    if not (counted.any((0, 1)) | ~windows.observed.any((0, 1))).all():
+        return None
+    part, own, coloured = at.of(windows), _trimmed(lin, at), bool((noise.tau > 0).any())
+    moments, held = part.moments(own), at.held(prior)
+    noise = updated_noise(part, moments, at.noise, theta, starts[at.kept], held, coloured, False)
+    return FollowedLook(Followed(counted, theta, starts, noise), part, own, lin)
+
+
+def onward(
+    windows: Windows, look: FollowedLook, prior: QuadraticPrior, tuning: FollowedTuning = FOLLOWED
+) -> WindowPoint | None:
+    """Where a step of theta and the starts leads, of all windows; None where nothing is to be gained, or one diverges.
+
+    Starts of windows that are not followed follow theta.
+    """
+    at = look.at
+    step = step_of(look, at.held(prior), tuning).point
+    if step is None:
+        return None
+    point = _starts_at(windows, look.every, at, step.theta)
+    if not np.isfinite(point.residual[windows.observed]).all():
+        return None
+    starts = point.starts.copy()
+    starts[at.kept] = step.starts
+    return WindowPoint(step.theta, starts, point.residual)
+
+
+def step_of(look: FollowedLook, prior: QuadraticPrior, tuning: FollowedTuning) -> Descent[WindowPoint]:
+    """A step downhill of theta and the starts of what is followed."""
+    at, energy = look.at, WindowEnergy(look.windows, look.at.noise, prior)
+    point = WindowPoint(at.theta, at.starts[at.kept], look.lin.residual)
+    linearised = ManyStarts(energy, point, look.windows.moments(look.lin), _SHARES)
+    return descend(linearised, _RULE.first, tuning.settled, _RULE)
+
+
+def _counted(
+    windows: Windows, residual: FloatArray, tau: FloatArray, tuning: FollowedTuning
+) -> tuple[BoolArray, FloatArray]:
+    """Samples (W, L, C) that count, none in windows that are not followed, and the noise's robust sd (C,)."""
+    observed = windows.observed
+    size = np.where(observed, np.abs(residual), np.nan)
+    measured = observed.any((0, 1))
+    middle = np.nanmedian(np.where(measured, size, 0.0), axis=(0, 1))
+    sd = np.maximum(NORMAL_MAD * middle, np.nan_to_num(windows.rounding))
+    near = observed & (np.abs(residual) <= tuning.far * sd)
+    every, some = observed.sum(1), near.sum(1)  # (W, C)
+    square = coefficients(windows.dt[:, None], tau) ** 2
+    freedom = np.maximum(some * (1 - square) / (1 + square), tuning.least)
+    most = scipy.stats.chi2.isf(tuning.chance / max(1, int((every > 0).sum())), freedom) / freedom
+    mean = np.where(near, residual**2, 0.0).sum(1) / np.maximum(some, 1)
+    followed = (every == 0) | ((mean <= sd**2 * most) & (every - some <= tuning.most_far * every))
+    return near & followed.all(1)[:, None, None], sd
+
+
+def _smooth(
+    windows: Windows,
+    lin: Linearisation,
+    theta: FloatArray,
+    starts: FloatArray,
+    sd: FloatArray,
+    tuning: FollowedTuning,
+) -> BoolArray:
+    """In which windows (W,) slopes over short changes of theta are those over wider ones, where they matter."""
+    wider = windows.linearise(theta, starts, with_starts=False, residual=lin.residual, theta_step=tuning.wider)
+    scale = np.maximum(sd, np.finfo(float).tiny)[:, None]
+    short, wide = lin.jacobian[..., : windows.num_theta] / scale, wider.jacobian / scale
+    apart, larger = (np.sqrt((x**2).sum((1, 2))) for x in (short - wide, np.maximum(np.abs(short), np.abs(wide))))
+    return np.asarray((apart <= np.maximum(tuning.differs * larger, tuning.matters)).all(1))
+
+
+def _trimmed(lin: Linearisation, at: Followed) -> Linearisation:
+    """Of the windows that are followed, and the samples that count."""
+    own = at.counted[at.kept]
+    jacobian = np.where(own[..., None], lin.jacobian[at.kept], 0.0)
+    return Linearisation(np.where(own, lin.residual[at.kept], 0.0), jacobian, True)
+
+
+def _starts_at(windows: Windows, lin: Linearisation, at: Followed, theta: FloatArray) -> WindowPoint:
+    """Starts at a theta (N,) that has moved: each takes the share of its own step that serves it best."""
+    n, white, precision = windows.num_theta, Noise(at.noise.sd, np.zeros_like(at.noise.tau)), windows.start_precision
+    left = (lin.residual - lin.jacobian[..., :n] @ (theta - at.theta)) / at.noise.sd
+    rows = lin.jacobian[..., n:] / at.noise.sd[:, None]
+    inner = np.einsum("wlci,wlcj->wij", rows, rows) + np.diag(precision)
+    force = np.einsum("wlci,wlc->wi", rows, left) - precision * at.starts
+    change = np.linalg.solve(inner, force[..., None])[..., 0]
+    change = np.where(np.isfinite(change), change, 0.0)  # of a window that all but diverges
+    energy = WindowEnergy(windows, white, QuadraticPrior(theta, np.zeros((n, n))))
+    point, moments = WindowPoint(at.theta, at.starts, lin.residual), windows.moments(lin, white=True)
+    return ManyStarts(energy, point, moments, _SHARES).simulated(theta, change)[0]
