@@ -54,6 +54,7 @@ class MisfitOptions(Options):
     alike: float = option(0.8, "of the best probe's statistic, from which another cause is named beside it", least=0)
     causes: int = option(3, "that are named at most", least=1)
     steps: int = option(4000, "of windows spread evenly over long logs: each probe is a simulation", "control steps")
+    rounding: float = option(2.0, "of the simulation's rounding, below which noise is that", least=1)
     batch: int = option(20, "draws of the null whose products are formed together", least=1)
 
 
@@ -278,9 +279,12 @@ class ProbedLogs:
     def whiteness(self, residual: FloatArray, noise: Noise) -> FloatArray:
         """Cube roots (2 C,) of what a residual (W, L, C) has of autocorrelation, and of its largest mean squares.
 
-        These are none where they are not asked.
+        These are none where they are not asked, and both of a channel whose noise is but the simulation's rounding, as
+        of a joint that rests: that follows itself.
         """
-        white, parts = self.white(residual, noise), MISFIT.pieces if self.steady else 0
+        rounds = noise.sd < MISFIT.rounding * self.windows.rounding
+        white = [z * (not own) for z, own in zip(self.white(residual, noise), rounds, strict=True)]
+        parts = MISFIT.pieces if self.steady else 0
         split = [np.array_split(z, parts) if parts else [] for z in white]
         pieces = [max((float((p**2).mean()) for p in own if len(p)), default=0.0) for own in split]
         return np.cbrt(np.array([autocorrelation(z) for z in white] + pieces))

@@ -298,7 +298,7 @@ class Laplace(Estimator[LaplaceState]):
         windows = self.bound(trajectories)
         if isinstance(windows, Windows) and isinstance(self.simulator, Simulator):
             assert isinstance(kept[0], WindowOptimum)
-            loose = not_followed(windows, kept[0])
+            loose = not_followed(windows, kept[0].judged_sd)
             if loose is not None:
                 self.find(Code.NOISE_EXCEEDS_SCATTER, channel=loose[0], ratio=loose[1])
         if state.draws is not None:

@@ -83,7 +83,7 @@ class FollowedTuning(Options):
 
     chance: float = option(0.05, "that a right model's noise leaves any window out", above=0)
     far: float = option(4.0, "from which a sample is left out: noise alone lies there once in 16,000", "sds", above=0)
-    most_far: float = option(0.25, "of a window's samples of a channel: with more it is not followed", above=0, most=1)
+    most_far: float = option(0.05, "of a window's samples of a channel: with more it is not followed", above=0, most=1)
     least: int = option(2, "samples that count in a window, however long they remember", "samples", least=1)
     wider: float = option(1e-3, "change of theta over which slopes are compared", "of the cube", above=0)
     differs: float = option(0.5, "of the larger slope, by which the two may differ in a window", above=0)

@@ -133,6 +133,17 @@ def close(one: FloatArray, other: FloatArray) -> None:
     np.testing.assert_allclose(one, other, atol=1e-10 * np.abs(other).max())
 
 
+@pytest.mark.parametrize(("size", "alone"), [(1.0, False), (10.0, True)])
+def test_rounding_that_follows_itself_is_no_finding(size: float, alone: bool) -> None:
+    """A sine a few times the simulation's rounding is seen, one of its size is not."""
+    logs = residuals(0.0)
+    sd = size * logs.windows.rounding
+    wave = np.broadcast_to(sd * np.sin(0.1 * np.arange(logs.residual.shape[1]))[:, None], logs.residual.shape)
+    seen = logs.whiteness(wave, Noise(sd, np.zeros_like(sd)))
+    assert bool((seen[: len(sd)] > 1).all()) == alone
+    assert bool((seen == 0).all()) != alone
+
+
 def test_products_formed_together_are_those_formed_one_by_one() -> None:
     made = residuals(0.9)
     draws, n = made.drawn(np.random.default_rng(0), 3), made.windows.num_theta

@@ -258,12 +258,11 @@ def _within_cube(theta: FloatArray, way: FloatArray) -> FloatArray:
     return np.where(moves, share * way, 0.0)
 
 
-def not_followed(windows: Windows, optimum: WindowOptimum) -> tuple[str, float] | None:
-    """The channel that a fit does not follow, and its noise over the scatter of its samples.
+def not_followed(windows: Windows, sd: FloatArray) -> tuple[str, float] | None:
+    """The channel that a fit with noise sds (C,) does not follow, and its noise over the scatter of its samples.
 
     Noise that is a good part of what a channel does is none where the samples do not scatter by it, whatever its time.
     """
-    sd = optimum.judged_sd
     excess = np.where(sd > THRESHOLDS.gross * windows.spread, sd / level(windows).sd, 0.0)
     worst = int(excess.argmax())
     return (windows.fitted[worst], float(excess[worst])) if excess[worst] > THRESHOLDS.noise_excess else None
