@@ -10,7 +10,7 @@ import scipy.stats
 
 from sipe_bayes.calibration.checks.fitted import Fit
 from sipe_bayes.calibration.checks.lacking import AskedWindows, asked_windows
-from sipe_bayes.core.findings import Code
+from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.evaluate import best_starts
@@ -203,8 +203,10 @@ def test_the_followed_optimum_stands_but_for_what_speaks_against_it(
     space = machine().space
     problem = SearchProblem(space, prior(space), 0, LaplaceOptions(), lambda _: None)
     estimates = 0.5 + shift + 0.1 * np.random.default_rng(0).standard_normal((8, 2))
-    scattered = followed_normal(sd=0.1)
+    whole = followed_normal(sd=0.1)
+    scattered = replace(whole, finding=finding(Code.SCATTER, groups=8, lost=0))
     assert stands(own, scattered, estimates, 24, problem) == takes
+    assert stands(followed_normal(sd=0.2), whole, 0.5 + 0 * estimates, 24, problem)  # of all windows, so no scatter
 
 
 def test_groups_contradict_seldom_by_chance_and_surely_where_they_are_off() -> None:

@@ -2,9 +2,8 @@
 
 Around their own optimum (``followed``) these windows change as smoothly as their slopes say, so that its curvature says
 how well theta is known. It stands in the place of the scatter of groups of windows (``growing_windows``), which is that
-of the wrong valleys in which their searches end, ten to a hundred times as wide; but where the groups are not all the
-same way off, few windows are followed, the search for the optimum has not come to an end, or it tells less than the
-scatter does.
+of the wrong valleys in which their searches end, ten to a hundred times as wide; unless all groups lie to one side of
+it, few windows are followed, the search for their optimum has not come to an end, or it tells less than the scatter.
 """
 
 from __future__ import annotations
@@ -98,7 +97,7 @@ def stands(
 
     Args:
         own: that.
-        scattered: the optimum of all windows, with the scatter of groups.
+        scattered: the optimum of all windows, with the scatter of groups where they scatter.
         estimates: (G, N) of these.
         among: how many windows there are.
         problem: what is searched.
@@ -109,7 +108,8 @@ def stands(
         return False
     if 0.5 * float(left @ np.linalg.solve(own.covariance, left)) > tuning.windows.most_drift:
         return False
-    if np.linalg.slogdet(own.covariance)[1] > np.linalg.slogdet(scattered.covariance)[1]:
+    wider = np.linalg.slogdet(own.covariance)[1] > np.linalg.slogdet(scattered.covariance)[1]
+    if scattered.scatters and wider:  # a curvature of all windows is narrow for no reason
         return False
     return not contradicted(own, estimates, tuning)
 
