@@ -26,7 +26,7 @@ Deviations:
 - The log's own noise is the one that the fit found, which for other methods than ``laplace`` need not be what the null
   estimates.
 - Probes are of a user's MJCF; of other environments only whiteness is asked, which slow misfit passes as slow noise.
-- Of windows through impacts samples and windows that lie far off were left out (``misfit.followed_windows``), of the
+- Of windows through impacts samples and windows that lie far off were left out (``laplace.windows.followed``), of the
   draws of the null none are: p is too large there by as little as noise alone lies so far. Whether noise is larger for
   a while is not asked there: what is left of an impact is, also where the model is right.
 - Where dry friction holds the simulated joint still, a small step of what acts on it changes nothing, and says nothing.

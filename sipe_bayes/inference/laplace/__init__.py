@@ -32,9 +32,12 @@ mean lies beyond it, and the truncated density is right up to the bound.
 5. Send scouts from draws of the prior: whoever comes to rest as low elsewhere is a further starting point
    (``windows.scouting``). Where starts are not measured and the logs are not followed, go on from where longer windows
    lead (``windows.longer_windows``).
-6. Keep the optima that are not the same and within ten nats of the best (``strategy.distinct``); they become components
+6. Through impacts fit groups of windows apart (``windows.growing_windows``), choose the windows that the model follows
+   and go to their optimum (``windows.followed``); its normal is the posterior, or the scatter of the groups
+   (``windows.followed_posterior``).
+7. Keep the optima that are not the same and within ten nats of the best (``strategy.distinct``); they become components
    of a mixture, weighted by their restricted likelihood.
-7. Probe whether the optima's normals are the posterior (``inference.importance``), and whether that goes on beyond a
+8. Probe whether the optima's normals are the posterior (``inference.importance``), and whether that goes on beyond a
    single one (``inference.stretches``); where they do not stand, importance draws and kernels on them take the normals'
    place, each optimum's on its own draws (``windows.draws``).
 
@@ -59,6 +62,8 @@ mean lies beyond it, and the truncated density is right up to the bound.
         v
       next starting point, or done
 
+    through impacts:  GROW beginnings, then ROUGH as above; after the last point each group of windows GROW, then FOLLOW
+
 With ``StateSpace`` every sample's state is unknown and ``state_space.search`` takes the place of ``windows.search``, or
 ``state_space.known_starts`` where the first states are known. All are a ``strategy.Strategy``: made of a
 ``SearchProblem`` and the bound logs, with a frozen state of their own.
@@ -78,7 +83,7 @@ else. ``tests/inference/laplace/test_levenberg_marquardt.py`` tells. Other numbe
   noise (``likelihood.noise_spread.sandwich``). Where the model is wrong at low frequencies, the full likelihood puts
   the misfit down to slow noise and may leave the parameters behind it undetermined; plain least squares keeps what
   predicts best.
-- Whether the posterior is normal is not asked where several optima have starts of their own, where residuals are as
+- Whether the posterior is normal is not asked through impacts, where several optima have starts of their own, where residuals are as
   small as the simulation's rounding or intervals as small as the search resolves, where the intervals are guessed;
   where starts are estimated it is only asked whether it is wider, and where states are inferred by draws from the
   normal. Where the budget has no room for it (6 N + 2 rollouts to ask of windows from known starts, 8 N + 2 and the
