@@ -83,10 +83,10 @@ else. ``tests/inference/laplace/test_levenberg_marquardt.py`` tells. Other numbe
   noise (``likelihood.noise_spread.sandwich``). Where the model is wrong at low frequencies, the full likelihood puts
   the misfit down to slow noise and may leave the parameters behind it undetermined; plain least squares keeps what
   predicts best.
-- Whether the posterior is normal is not asked through impacts, where several optima have starts of their own, where residuals are as
-  small as the simulation's rounding or intervals as small as the search resolves, where the intervals are guessed;
-  where starts are estimated it is only asked whether it is wider, and where states are inferred by draws from the
-  normal. Where the budget has no room for it (6 N + 2 rollouts to ask of windows from known starts, 8 N + 2 and the
-  unknowns of a start from estimated ones, up to 16 N + 2 of chains, and some hundreds for draws where it is none), a
-  finding says so.
+- Whether the posterior is normal is not asked through impacts, where several optima have starts of their own, where
+  residuals are as small as the simulation's rounding or intervals as small as the search resolves, where the intervals
+  are guessed; where starts are estimated it is only asked whether it is wider, and where states are inferred by draws
+  from the normal. Where the budget has no room for it (6 N + 2 rollouts to ask of windows from known starts, 8 N + 2
+  and the unknowns of a start from estimated ones, up to 16 N + 2 of chains, and some hundreds for draws where it is
+  none), a finding says so.
 """
