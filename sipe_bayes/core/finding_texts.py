@@ -186,8 +186,8 @@ class Code(Enum):
         "it where the model has it; measure {needed} to believe their errors"
     )
     SCATTER = note(
-        "impacts make the simulation rough: the intervals are not those of the curvature but of the scatter of "
-        "{groups} groups of windows fitted apart ({lost} of them lost)"
+        "impacts make the simulation rough, and {why}: the intervals are those of the scatter of {groups} groups of "
+        "windows fitted apart ({lost} of them lost)"
     )
     WINDOWS_LEFT_OUT = note("{left} of {windows} windows tell nothing: the model misses impacts there, or jumps there")
     SCATTER_UNKNOWN = blocking(

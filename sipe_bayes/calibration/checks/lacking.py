@@ -94,10 +94,10 @@ class AskedWindows:
     among: int
 
     @classmethod
-    def at(cls, at: Followed, windows: Windows, prior: QuadraticPrior) -> Self:
+    def at(cls, at: Followed, windows: Windows, prior: QuadraticPrior, lin: Linearisation | None = None) -> Self:
         """Those of some windows that are followed, at their optimum."""
         among, starts = windows.num_windows, at.starts[at.kept]
-        return cls(at.of(windows), at.theta, starts, at.noise, at.held(prior), None, among)
+        return cls(at.of(windows), at.theta, starts, at.noise, at.held(prior), lin, among)
 
     def probed(self, tell: Tell = silent, kept: Kept = NOTHING_KEPT) -> ProbedLogs:
         """With what extensions would do to them; of what follows impacts, noise may be larger for a while.
@@ -226,4 +226,4 @@ def asked_windows(method: Estimator, fit: Fit, believed: Posterior) -> AskedWind
     some = spread_windows(fit.windows, MISFIT.steps)
     windows = fit.windows.part(some)
     look = followed_windows(windows, fit.theta, fit.starts[some], fit.noise, prior)
-    return None if look is None else AskedWindows.at(look.at, windows, prior)
+    return None if look is None else AskedWindows.at(look.at, windows, prior, look.lin)

@@ -143,7 +143,7 @@ class ProbedLogs:
         starts = best_starts(windows, theta, noise) if starts is None else starts
         prior = QuadraticPrior(theta, np.zeros((len(theta), len(theta)))) if prior is None else prior
         self.windows, self.theta, self.noise, self.steady = windows, theta, noise, steady
-        self.starts = starts
+        self.starts, self.tells = starts, noise.sd >= MISFIT.rounding * windows.rounding
         linearisation = lin or windows.linearise(theta, starts)
         if not linearisation.valid:
             raise ValueError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
@@ -282,8 +282,7 @@ class ProbedLogs:
         These are none where they are not asked, and both of a channel whose noise is but the simulation's rounding, as
         of a joint that rests: that follows itself.
         """
-        rounds = noise.sd < MISFIT.rounding * self.windows.rounding
-        white = [z * (not own) for z, own in zip(self.white(residual, noise), rounds, strict=True)]
+        white = [z * told for z, told in zip(self.white(residual, noise), self.tells, strict=True)]
         parts = MISFIT.pieces if self.steady else 0
         split = [np.array_split(z, parts) if parts else [] for z in white]
         pieces = [max((float((p**2).mean()) for p in own if len(p)), default=0.0) for own in split]

@@ -138,8 +138,9 @@ def test_rounding_that_follows_itself_is_no_finding(size: float, alone: bool) ->
     """A sine a few times the simulation's rounding is seen, one of its size is not."""
     logs = residuals(0.0)
     sd = size * logs.windows.rounding
+    logs = ProbedLogs(logs.windows, logs.theta, Noise(sd, np.zeros_like(sd)), logs.starts)
     wave = np.broadcast_to(sd * np.sin(0.1 * np.arange(logs.residual.shape[1]))[:, None], logs.residual.shape)
-    seen = logs.whiteness(wave, Noise(sd, np.zeros_like(sd)))
+    seen = logs.whiteness(wave, logs.noise)
     assert bool((seen[: len(sd)] > 1).all()) == alone
     assert bool((seen == 0).all()) != alone
 

@@ -36,10 +36,11 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule, Descent, descend
 from sipe_bayes.inference.laplace.options import FollowedTuning, GrowingTuning
 from sipe_bayes.inference.laplace.windows.energy import WindowEnergy, WindowPoint, updated_noise
-from sipe_bayes.inference.laplace.windows.growing_windows import ManyStarts
+from sipe_bayes.inference.laplace.windows.growing_windows import ManyStarts, counted
 from sipe_bayes.inference.laplace.windows.state import Followed
 from sipe_bayes.likelihood.noise import NORMAL_MAD, Noise, coefficients
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.likelihood.restricted import eliminate_starts
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 
 FOLLOWED, _SHARES, _RULE = FollowedTuning(), GrowingTuning().shares, DampingRule()
@@ -112,17 +113,17 @@ def followed_at(
     lin = windows.linearise(theta, starts)
     if not lin.valid:
         return None
-    counted, sd = _counted(windows, lin.residual, noise.tau, tuning)
-    counted &= _smooth(windows, lin, theta, starts, sd, tuning)[:, None, None]
-    at = Followed(counted, theta, starts, Noise(sd, noise.tau))
+    near, sd = _near(windows, lin.residual, noise.tau, tuning)
+    near &= _smooth(windows, lin, theta, starts, sd, tuning)[:, None, None]
+    at = Followed(near, theta, starts, Noise(sd, noise.tau))
     if len(at.kept) < max(tuning.fewest, tuning.share * windows.num_windows):
         return None
-    if not (counted.any((0, 1)) | ~windows.observed.any((0, 1))).all():
+    if not (near.any((0, 1)) | ~windows.observed.any((0, 1))).all():
         return None
     part, own, coloured = at.of(windows), _trimmed(lin, at), bool((noise.tau > 0).any())
     moments, held = part.moments(own), at.held(prior)
     noise = updated_noise(part, moments, at.noise, theta, starts[at.kept], held, coloured, False)
-    return FollowedLook(Followed(counted, theta, starts, noise), part, own, lin)
+    return FollowedLook(Followed(near, theta, starts, noise), part, own, lin)
 
 
 def onward(
@@ -133,7 +134,7 @@ def onward(
     Starts of windows that are not followed follow theta.
     """
     at = look.at
-    step = step_of(look, at.held(prior), tuning).point
+    step = _step(windows, look, at.held(prior), tuning).point
     if step is None:
         return None
     point = _starts_at(windows, look.every, at, step.theta)
@@ -144,15 +145,50 @@ def onward(
     return WindowPoint(step.theta, starts, point.residual)
 
 
-def step_of(look: FollowedLook, prior: QuadraticPrior, tuning: FollowedTuning) -> Descent[WindowPoint]:
+def _step(windows: Windows, look: FollowedLook, prior: QuadraticPrior, tuning: FollowedTuning) -> Descent[WindowPoint]:
     """A step downhill of theta and the starts of what is followed."""
-    at, energy = look.at, WindowEnergy(look.windows, look.at.noise, prior)
-    point = WindowPoint(at.theta, at.starts[at.kept], look.lin.residual)
-    linearised = ManyStarts(energy, point, look.windows.moments(look.lin), _SHARES)
-    return descend(linearised, _RULE.first, tuning.settled, _RULE)
+    at, part, before = look.at, look.windows, windows.rollouts
+    part.rollouts, part.budget = before, windows.budget
+    energy, point = WindowEnergy(part, at.noise, prior), WindowPoint(at.theta, at.starts[at.kept], look.lin.residual)
+    linearised = ManyStarts(energy, point, part.moments(look.lin), _SHARES)
+    descent = descend(linearised, _RULE.first, tuning.settled, _RULE)
+    counted(windows, part, before)
+    return descent
 
 
-def _counted(
+def agreement(look: FollowedLook, groups: int) -> float:
+    """Chance that groups of windows that are followed would ask for as different values: small where a model is wrong.
+
+    Each group's theta is that of its linearisation; what they leave less than one theta for all does is chi-square
+    (W. G. Cochran, "The combination of estimates from different experiments", 1954, https://doi.org/10.2307/3001666).
+
+    Args:
+        look: at the optimum of all of them.
+        groups: at most, of two windows or more, taken in turn.
+    """
+    at, windows, kept = look.at, look.windows, look.at.starts[look.at.kept]
+    count, n = min(groups, len(kept) // 2), len(look.at.theta)
+    precision, gradient, gained = np.zeros((n, n)), np.zeros(n), 0.0
+    for number in range(count):
+        own = np.arange(number, len(kept), count)
+        moments = windows.part(own, windows.observed[own]).moments(
+            Linearisation(look.lin.residual[own], look.lin.jacobian[own], True)
+        )
+        pull = -windows.start_precision * kept[own]
+        solved = eliminate_starts(moments.normal(at.noise), n, windows.start_precision, pull)
+        gained += float(
+            solved.gradient @ np.linalg.pinv(solved.precision, rcond=1e-12, hermitian=True) @ solved.gradient
+        )
+        precision, gradient = precision + solved.precision, gradient + solved.gradient
+    return float(scipy.stats.chi2.sf(gained - _explained(precision, gradient), n * (count - 1)))
+
+
+def _explained(precision: FloatArray, gradient: FloatArray) -> float:
+    """Twice the nats that a step gains; none of directions that nothing tells."""
+    return float(gradient @ np.linalg.pinv(precision, rcond=1e-12, hermitian=True) @ gradient)
+
+
+def _near(
     windows: Windows, residual: FloatArray, tau: FloatArray, tuning: FollowedTuning
 ) -> tuple[BoolArray, FloatArray]:
     """Samples (W, L, C) that count, none in windows that are not followed, and the noise's robust sd (C,)."""

@@ -2,8 +2,9 @@
 
 Around their own optimum (``followed``) these windows change as smoothly as their slopes say, so that its curvature says
 how well theta is known. It stands in the place of the scatter of groups of windows (``growing_windows``), which is that
-of the wrong valleys in which their searches end, ten to a hundred times as wide; unless all groups lie to one side of
-it, few windows are followed, the search for their optimum has not come to an end, or it tells less than the scatter.
+of the wrong valleys in which their searches end, and far wider; unless few windows are followed, they ask for different
+values where the model lacks something (``followed.agreement``), the search for their optimum has not come to an end,
+or they tell less than the scatter does. Which of these it is, is a ``Doubt``.
 """
 
 from __future__ import annotations
@@ -11,16 +12,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import scipy.stats
 
-from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, finding
-from sipe_bayes.inference.laplace.options import LaplaceTuning
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.laplace.windows.energy import updated_noise
-from sipe_bayes.inference.laplace.windows.followed import FollowedLook, followed_at, onward
-from sipe_bayes.inference.laplace.windows.growing_windows import mean_of_groups
-from sipe_bayes.inference.laplace.windows.optimum import Ending, summarised
+from sipe_bayes.inference.laplace.windows.followed import FollowedLook, agreement, followed_at, onward
+from sipe_bayes.inference.laplace.windows.growing_windows import Doubt, scatter_finding
+from sipe_bayes.inference.laplace.windows.optimum import Ending, sandwiches, summarised
 from sipe_bayes.inference.laplace.windows.state import WindowOptimum, WindowState
 from sipe_bayes.likelihood.restricted import eliminate_starts
 from sipe_bayes.likelihood.windows import Windows
@@ -36,29 +34,31 @@ def followed_step(problem: SearchProblem, windows: Windows, state: WindowState) 
     """
     here, prior, tuning = state.here, problem.quadratic_prior, problem.options.tuning.followed
     look = followed_at(windows, here.theta, here.starts, here.noise, prior, tuning)
-    if look is None:
-        return replace(state, done=True)
-    step = onward(windows, look, prior, tuning) if here.iteration + 1 < tuning.rounds else None
-    if step is not None:
+    step = None
+    if look is not None and here.iteration + 1 < tuning.rounds:
+        step = onward(windows, look, prior, tuning)
+    if look is not None and step is not None:
         moved = replace(here, theta=step.theta, starts=step.starts, noise=look.at.noise, iteration=here.iteration + 1)
         return replace(state, here=moved)
-    (scattered,) = state.optima
-    optimum = replace(scattered, followed=look.at)
-    own = followed_optimum(problem, windows, optimum, look)
-    if stands(own, optimum, np.stack(state.estimates), windows.num_windows, problem):
-        optimum = own
-    return replace(state, optima=(optimum,), done=True)
+    (whole,), growing = state.optima, problem.options.tuning.growing
+    own = None if look is None else followed_optimum(problem, windows, whole, look)
+    doubt = Doubt.FEW if look is None or own is None else doubted(problem, windows, own, whole, look)
+    if own is None or doubt is not None:
+        own = replace(whole, followed=None if look is None else look.at)
+        if whole.scatters and doubt is not None:
+            own = replace(own, finding=scatter_finding(np.stack(state.estimates), growing, doubt))
+    return replace(state, optima=(own,), done=True)
 
 
 def followed_optimum(
-    problem: SearchProblem, windows: Windows, scattered: WindowOptimum, look: FollowedLook
+    problem: SearchProblem, windows: Windows, whole: WindowOptimum, look: FollowedLook
 ) -> WindowOptimum:
     """The optimum of the windows that are followed; noise, starts and their slope are those of all windows there.
 
     Args:
         problem: what is searched.
         windows: all of them.
-        scattered: the optimum of all.
+        whole: the optimum of all.
         look: what is followed.
     """
     at, part = look.at, look.windows
@@ -69,7 +69,7 @@ def followed_optimum(
         part.moments(look.lin),
         look.lin.residual,
         look.lin.jacobian,
-        begin=scattered.theta,
+        begin=whole.theta,
         steps=problem.options.tuning.followed.rounds,
         first_misfit=1.0,
         refused=0.0,
@@ -83,43 +83,33 @@ def followed_optimum(
     noise = updated_noise(windows, moments, at.noise, at.theta, at.starts, prior, coloured, False)
     pull = -windows.start_precision * at.starts
     slope = eliminate_starts(moments.normal(at.noise), moments.num_theta, windows.start_precision, pull).slope
-    own = replace(own, sd=noise.sd, tau=noise.tau, starts=at.starts, slope=slope, followed=at)
+    own = replace(own, sd=noise.sd, tau=noise.tau, starts=at.starts, slope=slope, followed=at, trims=True)
     left = windows.num_windows - len(at.kept)
     return replace(
         own, finding=finding(Code.WINDOWS_LEFT_OUT, left=left, windows=windows.num_windows) if left else None
     )
 
 
-def stands(
-    own: WindowOptimum, scattered: WindowOptimum, estimates: FloatArray, among: int, problem: SearchProblem
-) -> bool:
-    """Whether the optimum of what is followed is the posterior.
+def doubted(
+    problem: SearchProblem, windows: Windows, own: WindowOptimum, whole: WindowOptimum, look: FollowedLook
+) -> Doubt | None:
+    """What speaks against the optimum of the windows that are followed; None where nothing does.
 
     Args:
-        own: that.
-        scattered: the optimum of all windows, with the scatter of groups where they scatter.
-        estimates: (G, N) of these.
-        among: how many windows there are.
         problem: what is searched.
+        windows: all of them.
+        own: that optimum.
+        whole: the optimum of all windows, with the scatter of groups where they scatter.
+        look: what is followed.
     """
-    tuning, left = problem.options.tuning, own.mean - own.theta
-    assert own.followed is not None
-    if len(own.followed.kept) < tuning.followed.most * among:
-        return False
+    tuning, left = problem.options.tuning, np.clip(own.mean, 0, 1) - own.theta
+    if sandwiches(windows):
+        return Doubt.SANDWICH
+    if len(look.at.kept) < tuning.followed.most * windows.num_windows:
+        return Doubt.FEW
     if 0.5 * float(left @ np.linalg.solve(own.covariance, left)) > tuning.windows.most_drift:
-        return False
-    wider = np.linalg.slogdet(own.covariance)[1] > np.linalg.slogdet(scattered.covariance)[1]
-    if scattered.scatters and wider:  # a curvature of all windows is narrow for no reason
-        return False
-    return not contradicted(own, estimates, tuning)
-
-
-def contradicted(own: WindowOptimum, estimates: FloatArray, tuning: LaplaceTuning) -> bool:
-    """Whether groups' estimates (G, N) lie farther to one side of an optimum than they scatter, in any parameter.
-
-    By Student's t of their mean, at ``tuning.followed.apart`` of all parameters together.
-    """
-    mean, covariance, freedom = mean_of_groups(estimates, tuning.growing)
-    sd = np.sqrt(np.diag(covariance) + np.diag(own.covariance))
-    most = scipy.stats.t.isf(0.5 * tuning.followed.apart / len(mean), freedom)
-    return bool((np.abs(mean - own.mean) > most * sd).any())
+        return Doubt.UNSETTLED
+    if agreement(look, tuning.growing.groups) < tuning.followed.apart:
+        return Doubt.APART
+    wider = np.linalg.slogdet(own.covariance)[1] > np.linalg.slogdet(whole.covariance)[1]
+    return Doubt.WIDER if whole.scatters and wider else None  # a curvature of all windows is narrow for no reason

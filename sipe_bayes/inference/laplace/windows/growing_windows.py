@@ -30,11 +30,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from enum import StrEnum
 
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.findings import Code, finding
+from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.envs.poses import inertial_joints
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule, descend
 from sipe_bayes.inference.laplace.options import GrowingTuning
@@ -46,6 +47,17 @@ from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import marginal
 from sipe_bayes.likelihood.starts.estimates import STATE_STEP
 from sipe_bayes.likelihood.windows import Windows
+
+
+class Doubt(StrEnum):
+    """Why the scatter of groups is the posterior, and not the optimum of the windows that are followed."""
+
+    UNASKED = "the budget left no room to choose the windows that the model follows"
+    FEW = "the model follows too few windows"
+    SANDWICH = 'of the windows that the model follows nothing is known with noise = "sandwich"'
+    UNSETTLED = "no search came to the optimum of the windows that the model follows"
+    APART = "the windows that the model follows ask for different values"
+    WIDER = "the windows that the model follows tell less"
 
 
 class ManyStarts(LinearisedWindows):
@@ -237,30 +249,33 @@ def scattered(
     """
     if slips:
         optimum = replace(optimum, finding=finding(Code.SLIPS, groups=len(estimates)))
-    mean, covariance, freedom = mean_of_groups(estimates, tuning)
-    n, lost = len(mean), len(estimates) - 1 - freedom
+    kept = _reliable(estimates, tuning)
+    n, freedom = estimates.shape[1], len(kept) - 1
+    covariance = np.atleast_2d(np.cov(kept.T)) / len(kept)
     excess = float(np.trace(np.linalg.solve(optimum.covariance, covariance))) / n
     if excess < tuning.rough:
         return optimum
     if freedom < 2 * n:  # so few say nothing of correlations
         covariance = np.diag(np.diag(covariance))
     covariance = not_below(covariance * freedom / (freedom - 2), optimum.covariance)  # of Student's t
-    half = 0.5 * (mean - optimum.theta)
+    half = 0.5 * (kept.mean(0) - optimum.theta)
     covariance = covariance + np.outer(half, half)
-    reason = optimum.finding if slips else finding(Code.SCATTER, groups=len(estimates), lost=lost)
+    reason = optimum.finding if slips else scatter_finding(estimates, tuning, Doubt.UNASKED)
     return replace(optimum, mean=optimum.theta + half, covariance=covariance, finding=reason)
 
 
-def mean_of_groups(estimates: FloatArray, tuning: GrowingTuning) -> tuple[FloatArray, FloatArray, int]:
-    """Mean (N,) of the estimates (G, N) of groups, its covariance (N, N) by their scatter, and degrees of freedom.
+def scatter_finding(estimates: FloatArray, tuning: GrowingTuning, why: Doubt) -> Finding:
+    """That the normal is that of the scatter of groups' estimates (G, N), and why."""
+    lost = len(estimates) - len(_reliable(estimates, tuning))
+    return finding(Code.SCATTER, groups=len(estimates), lost=lost, why=why)
 
-    Estimates far from the others, whose search was lost, count for nothing while ``tuning.reliable`` are left.
-    """
+
+def _reliable(estimates: FloatArray, tuning: GrowingTuning) -> FloatArray:
+    """Without those far from the others, whose search was lost, while ``tuning.reliable`` are left."""
     gap = np.abs(estimates - np.median(estimates, axis=0))
     scale = NORMAL_MAD * np.median(gap, axis=0)
     kept = estimates[(gap <= tuning.lost * np.maximum(scale, 1e-9)).all(1)]
-    kept = estimates if len(kept) < tuning.reliable else kept
-    return kept.mean(0), np.atleast_2d(np.cov(kept.T)) / len(kept), len(kept) - 1
+    return estimates if len(kept) < tuning.reliable else kept
 
 
 def not_below(covariance: FloatArray, least: FloatArray) -> FloatArray:

@@ -166,7 +166,7 @@ class WindowSearch:
             return onward
         if num_groups(self.windows, self._tuning.growing):
             cut_short = tuple(replace(o, finding=finding(Code.SEARCH_CUT_SHORT)) for o in state.optima)  # until then
-            return replace(state, here=self._apart(0, state), optima=cut_short, aside=state.optima)
+            return replace(state, here=self._apart(0, state), optima=cut_short, aside=state.optima, estimates=())
         if not may_touch(self.windows.simulator.model):
             return onward
         unknown = finding(Code.SCATTER_UNKNOWN, windows=self.windows.num_windows)

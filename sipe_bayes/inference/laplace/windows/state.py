@@ -169,6 +169,7 @@ class WindowOptimum(Optimum):
         heavier: whether places that the normal all but excludes fit nearly as well.
         finding: why its intervals are not to be trusted; None where they may be.
         followed: windows that are followed through impacts, and where; None where that was not asked, or they are few.
+        trims: whether the normal is that of these windows.
     """
 
     starts: FloatArray
@@ -177,6 +178,7 @@ class WindowOptimum(Optimum):
     heavier: bool = False
     finding: Finding | None = None
     followed: Followed | None = None
+    trims: bool = False
 
     @property
     def unsmooth(self) -> bool:
@@ -189,14 +191,9 @@ class WindowOptimum(Optimum):
         return self.finding is not None and self.finding.code is Code.SCATTER
 
     @property
-    def trims(self) -> bool:
-        """Whether its normal is that of the windows that are followed."""
-        return self.followed is not None and bool((self.followed.theta == self.theta).all())
-
-    @property
     def judged_sd(self) -> FloatArray:
         """Noise (C,) that says whether the fit follows the logs: of the windows that its normal is of."""
-        return self.sd if self.followed is None or not self.trims else self.followed.noise.sd
+        return self.followed.noise.sd if self.followed is not None and self.trims else self.sd
 
     @property
     def unexplained(self) -> bool:
