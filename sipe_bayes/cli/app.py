@@ -311,15 +311,18 @@ def _errors(scores: Sequence[ChannelScore]) -> tuple[list[float], list[float]]:
 
 
 def _worst(findings: Findings, out: str) -> list[str]:
-    """The warnings that matter most; how many there are beside them."""
+    """The warnings that matter most, how many there are beside them, and what no log tells."""
+    from sipe_bayes.core.findings import Code
+
     kinds = findings.kinds
     lines = [f"warning: {_cut(text)}" for text in kinds[:_WARNINGS]]
     if len(kinds) > len(lines):
         lines[-1] += f" [{len(kinds) - len(lines)} more in the report]"
+    lines += [f"note: {_cut(item.text)}" for item in findings.of(Code.UNTOLD)]
     where = (
         shlex.quote(out)
         if out
-        else " ".join(dict.fromkeys(str(item.code) for item in findings if item.text in kinds[:_WARNINGS]))
+        else " ".join(dict.fromkeys(str(item.code) for item in findings if item.text in kinds[:_WARNINGS])) or "untold"
     )
     return lines + [f"what these mean and what to do: sipe explain {where}"] * bool(lines)
 

@@ -11,7 +11,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -222,7 +222,8 @@ def _context(calibration: Calibration, images: Sequence[Picture], clip: Clip | N
         "tone": "bad" if "bad" in tones else "fair" if "fair" in tones or calibration.warnings else "good",
         "headline": sentences[0].text,
         "sentences": sentences[1:],
-        "warnings": noticed(calibration.findings),
+        "warnings": noticed(item for item in calibration.findings if item.severity is not Severity.NOTE),
+        "notes": noticed(notes(calibration)),
         "lacks": lacking(Findings(calibration.findings)),
         "parameters": [row for p, row in rows if not p.nuisance],
         "nuisance": [row for p, row in rows if p.nuisance],
@@ -244,12 +245,18 @@ def _context(calibration: Calibration, images: Sequence[Picture], clip: Clip | N
     }
 
 
-def noticed(findings: Sequence[Finding]) -> list[dict[str, object]]:
-    """The findings that are no notes, worst first, those of one code together, with what to do, split at code."""
+def notes(calibration: Calibration) -> list[Finding]:
+    """Those that no other part of the page has."""
+    shown = " ".join(calibration.left_out)
+    own = (item for item in calibration.findings if item.severity is Severity.NOTE and item.log is None)
+    return [item for item in own if item.text not in shown]
+
+
+def noticed(findings: Iterable[Finding]) -> list[dict[str, object]]:
+    """Findings, worst first, those of one code together, with what to do, split at code."""
     groups: dict[Code, list[str]] = {}
     for item in Findings(findings).ranked:
-        if item.severity is not Severity.NOTE:
-            groups.setdefault(item.code, []).append(item.text)
+        groups.setdefault(item.code, []).append(item.text)
     return [{"texts": texts, "advice": ADVICE[code].split("`")} for code, texts in groups.items()]
 
 

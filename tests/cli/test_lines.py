@@ -7,8 +7,9 @@ from dataclasses import replace
 import pytest
 
 from sipe_bayes.cli.app import print_calibration
+from sipe_bayes.core.findings import Code, Severity
 from sipe_bayes.diagnostics.records import ChannelScore
-from tests.problems.calibrations import make_calibration
+from tests.problems.calibrations import make_calibration, noticed
 
 
 def printed(capsys: pytest.CaptureFixture[str], channels: dict[str, str]) -> list[str]:
@@ -44,3 +45,13 @@ def test_parameters_without_a_row_are_named(capsys: pytest.CaptureFixture[str]) 
     first = int(rows[-1][1:]) + 1
     named = ", ".join(f"p{k}" for k in range(first, first + 4))
     assert line == f"values and intervals of {named} and {20 - first} more: in the report"
+
+
+def test_what_no_log_tells_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of notes it alone says that values may be off by more than their intervals."""
+    notes = [noticed(code, severity=Severity.NOTE, text=f"about {code.name}") for code in (Code.UNTOLD, Code.SCATTER)]
+    print_calibration(replace(make_calibration(), findings=tuple(notes)))
+    lines = capsys.readouterr().out.splitlines()
+    assert "note: about UNTOLD" in lines
+    assert "what these mean and what to do: sipe explain untold" in lines
+    assert "SCATTER" not in "".join(lines)

@@ -11,7 +11,7 @@ import pytest
 
 from sipe_bayes.core import files
 from sipe_bayes.core.finding_advice import ADVICE
-from sipe_bayes.core.findings import Code
+from sipe_bayes.core.findings import Code, Severity
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.diagnostics.records import (
     ChannelNoise,
@@ -183,6 +183,24 @@ def test_findings_of_one_kind_stand_together_with_what_to_do(calibration: Calibr
     assert all(item.text in page.text for item in found.findings)
     assert page.text.count(ADVICE[Code.DEAD_RANGE].replace("`", "")) == 1
     assert ADVICE[Code.NO_EFFECT].replace("`", "") in page.text
+
+
+def test_notes_are_in_the_page_once(calibration: Calibration) -> None:
+    """What the numbers rest on; notes of a log stand with it, others where the part is that they are about."""
+    notes = [
+        noticed(Code.SCATTER, severity=Severity.NOTE, text="a scatter of groups"),
+        noticed(Code.RESIDUALS_LEFT_OUT, severity=Severity.NOTE, text="residuals of no meaning"),
+    ]
+    of_log = dataclasses.replace(
+        noticed(Code.LOG_CLOCK, severity=Severity.NOTE, text="a clock that jumps"), log="log 1"
+    )
+    page = Page(report.render(dataclasses.replace(calibration, findings=(*notes, of_log)), []))
+    assert "What the numbers rest on: 1 note" in page.text
+    assert ADVICE[Code.SCATTER].replace("`", "") in page.text
+    assert [page.text.count(item.text) for item in notes] == [1, 1]
+    assert page.text.count(of_log.text) == 0  # the table of logs has it from the report of that log
+    bare = Page(report.render(dataclasses.replace(calibration, findings=()), []))
+    assert "What the numbers rest on" not in bare.text
 
 
 # Files
