@@ -1,4 +1,4 @@
-"""Do intervals from the scatter of groups hold the truth? Bodies thrown on a floor, truths and tosses by seed.
+"""Do intervals through impacts hold the truth? Bodies thrown on a floor, truths and tosses by seed.
 
     python examples/studies/tosses.py                              # 20 sets of each body: an hour and a half
     python examples/studies/tosses.py --body brick --seeds 5
