@@ -171,14 +171,11 @@ def agreement(look: FollowedLook, groups: int) -> float:
     precision, gradient, gained = np.zeros((n, n)), np.zeros(n), 0.0
     for number in range(count):
         own = np.arange(number, len(kept), count)
-        moments = windows.part(own, windows.observed[own]).moments(
-            Linearisation(look.lin.residual[own], look.lin.jacobian[own], True)
-        )
+        lin = Linearisation(look.lin.residual[own], look.lin.jacobian[own], True)
+        moments = windows.part(own).moments(lin)
         pull = -windows.start_precision * kept[own]
         solved = eliminate_starts(moments.normal(at.noise), n, windows.start_precision, pull)
-        gained += float(
-            solved.gradient @ np.linalg.pinv(solved.precision, rcond=1e-12, hermitian=True) @ solved.gradient
-        )
+        gained += _explained(solved.precision, solved.gradient)
         precision, gradient = precision + solved.precision, gradient + solved.gradient
     return float(scipy.stats.chi2.sf(gained - _explained(precision, gradient), n * (count - 1)))
 
