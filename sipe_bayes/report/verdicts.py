@@ -247,7 +247,8 @@ def lack(calibration: Calibration) -> Verdict | None:
     """What the model lacks, where that matters; the warnings say more."""
     misfit = calibration.misfit
     if misfit is None and any(f.code is Code.MISFIT_NOT_ASKED for f in calibration.findings):
-        return Verdict("fair", "Whether the model lacks something was not asked: it follows too few windows, or slips.")
+        few = "it follows too few windows, or slips; values may lie beyond their intervals"
+        return Verdict("fair", f"Whether the model lacks something was not asked: {few}.")
     if misfit is None or not misfit.alarm:
         return None
     share = f"{number(100 * misfit.share[misfit.channel], 2)} % of the residual of {misfit.channel}"

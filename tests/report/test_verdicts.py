@@ -197,7 +197,9 @@ def test_what_the_model_lacks_says_where_values_would_be(calibration: Calibratio
     assert tied.text.endswith("tries it.")
     impacts = dataclasses.replace(calibration, findings=(noticed(Code.MISFIT_NOT_ASKED, severity=Severity.NOTE),))
     assert judged.lack(impacts) == judged.Verdict(
-        "fair", "Whether the model lacks something was not asked: it follows too few windows, or slips."
+        "fair",
+        "Whether the model lacks something was not asked: it follows too few windows, or slips; values may lie beyond "
+        "their intervals.",
     )
 
 
