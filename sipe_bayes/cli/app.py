@@ -318,12 +318,10 @@ def _worst(findings: Findings, out: str) -> list[str]:
     lines = [f"warning: {_cut(text)}" for text in kinds[:_WARNINGS]]
     if len(kinds) > len(lines):
         lines[-1] += f" [{len(kinds) - len(lines)} more in the report]"
-    lines += [f"note: {_cut(item.text)}" for item in findings.of(Code.UNTOLD)]
-    where = (
-        shlex.quote(out)
-        if out
-        else " ".join(dict.fromkeys(str(item.code) for item in findings if item.text in kinds[:_WARNINGS])) or "untold"
-    )
+    untold = findings.of(Code.UNTOLD)
+    lines += [f"note: {_cut(item.text)}" for item in untold]
+    shown = [*(item for item in findings if item.text in kinds[:_WARNINGS]), *untold]
+    where = shlex.quote(out) if out else " ".join(dict.fromkeys(str(item.code) for item in shown))
     return lines + [f"what these mean and what to do: sipe explain {where}"] * bool(lines)
 
 

@@ -35,7 +35,7 @@ FLAGS: Mapping[Code, str] = {
 }
 """Findings about single parameters, and the flag that result.json has for them."""
 NUISANCE = "nuisance"
-_PROCESS_NOISE = (Code.PROCESS_NOISE, Code.PROCESS_OUTLIERS, Code.PROCESS_NOISE_SMALL, Code.PROCESS_NOISE_LARGE)
+PROCESS_NOISE = (Code.PROCESS_NOISE, Code.PROCESS_OUTLIERS, Code.PROCESS_NOISE_SMALL, Code.PROCESS_NOISE_LARGE)
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ class Calibration:
     def left_out(self) -> list[str]:
         """Sentences about parts of the report that do not apply, and what there is in their place."""
         findings = Findings(self.findings)
-        noise = " ".join(item.text for item in findings.of(*_PROCESS_NOISE))
+        noise = " ".join(item.text for item in findings.of(*PROCESS_NOISE))
         return [item.text for item in findings.of(Code.RESIDUALS_LEFT_OUT)] + [noise] * bool(noise)
 
     def flags(self, name: str) -> tuple[str, ...]:

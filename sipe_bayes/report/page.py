@@ -24,7 +24,7 @@ from sipe_bayes.core.html import Page
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, LogReport, Mixing, improvement
-from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
+from sipe_bayes.diagnostics.result import PROCESS_NOISE, Calibration, ParameterSummary
 from sipe_bayes.report import calibration_plots as plots
 from sipe_bayes.report.drawing import inside_page, png, uncollected
 from sipe_bayes.report.interactive.charts import charts
@@ -247,9 +247,8 @@ def _context(calibration: Calibration, images: Sequence[Picture], clip: Clip | N
 
 def notes(calibration: Calibration) -> list[Finding]:
     """Those that no other part of the page has."""
-    shown = " ".join(calibration.left_out)
     own = (item for item in calibration.findings if item.severity is Severity.NOTE and item.log is None)
-    return [item for item in own if item.text not in shown]
+    return [item for item in own if item.code not in (Code.RESIDUALS_LEFT_OUT, *PROCESS_NOISE)]
 
 
 def noticed(findings: Iterable[Finding]) -> list[dict[str, object]]:

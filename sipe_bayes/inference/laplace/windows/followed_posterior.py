@@ -41,13 +41,15 @@ def followed_step(problem: SearchProblem, windows: Windows, state: WindowState) 
         moved = replace(here, theta=step.theta, starts=step.starts, noise=look.at.noise, iteration=here.iteration + 1)
         return replace(state, here=moved)
     (whole,), growing = state.optima, problem.options.tuning.growing
-    own = None if look is None else followed_optimum(problem, windows, whole, look)
-    doubt = Doubt.FEW if look is None or own is None else doubted(problem, windows, own, whole, look)
-    if own is None or doubt is not None:
-        own = replace(whole, followed=None if look is None else look.at)
-        if whole.scatters and doubt is not None:
-            own = replace(own, finding=scatter_finding(np.stack(state.estimates), growing, doubt))
-    return replace(state, optima=(own,), done=True)
+    end = whole
+    doubt: Doubt | None = Doubt.FEW
+    if look is not None:
+        own = followed_optimum(problem, windows, whole, look)
+        doubt = doubted(problem, windows, own, whole, look)
+        end = own if doubt is None else replace(whole, followed=look.at)
+    if doubt is not None and whole.scatters:
+        end = replace(end, finding=scatter_finding(np.stack(state.estimates), growing, doubt))
+    return replace(state, optima=(end,), done=True)
 
 
 def followed_optimum(
