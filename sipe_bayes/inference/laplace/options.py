@@ -88,6 +88,7 @@ class FollowedTuning(Options):
     wider: float = option(1e-3, "change of theta over which slopes are compared", "of the cube", above=0)
     differs: float = option(0.5, "of the larger slope, by which the two may differ in a window", above=0)
     matters: float = option(1.0, "that a parameter moves a window over its range: smaller slopes", "sds", above=0)
+    first: int = option(6, "control steps on which starts of lost windows are looked for first", least=1)
     rounds: int = option(6, "in which windows are chosen; but for the last a step follows each", least=1)
     settled: float = option(0.1, "that a step has to promise", "nats", above=0)
     fewest: int = option(4, "followed windows that say something", least=1)

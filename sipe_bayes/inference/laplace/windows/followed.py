@@ -32,18 +32,18 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.stats
 
-from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule, Descent, descend
 from sipe_bayes.inference.laplace.options import FollowedTuning, GrowingTuning
 from sipe_bayes.inference.laplace.windows.energy import WindowEnergy, WindowPoint, updated_noise
-from sipe_bayes.inference.laplace.windows.growing_windows import ManyStarts, counted
+from sipe_bayes.inference.laplace.windows.growing_windows import ManyStarts, counted, grown_starts
 from sipe_bayes.inference.laplace.windows.state import Followed
 from sipe_bayes.likelihood.noise import NORMAL_MAD, Noise, coefficients
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import eliminate_starts
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 
-FOLLOWED, _SHARES, _RULE = FollowedTuning(), GrowingTuning().shares, DampingRule()
+FOLLOWED, _GROWING, _RULE = FollowedTuning(), GrowingTuning(), DampingRule()
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class FollowedLook:
 
 def followed_cost(windows: Windows, tuning: FollowedTuning = FOLLOWED) -> int:
     """Rollouts of ``followed_windows`` as a rule, where no step is refused."""
-    each = 1 + 2 * windows.num_theta + windows.num_start + 2 * len(_SHARES)
+    each = 1 + 2 * windows.num_theta + windows.num_start + 2 * len(_GROWING.shares)
     return tuning.rounds * each * len(windows.trajectories)
 
 
@@ -97,7 +97,7 @@ def followed_windows(
         step = None if look is None else onward(windows, look, prior, tuning)
         if look is None or step is None:
             return look
-        look = followed_at(windows, step.theta, step.starts, look.at.noise, prior, tuning)
+        look = followed_at(windows, *step, look.at.noise, prior, tuning)
     return look
 
 
@@ -128,21 +128,41 @@ def followed_at(
 
 def onward(
     windows: Windows, look: FollowedLook, prior: QuadraticPrior, tuning: FollowedTuning = FOLLOWED
-) -> WindowPoint | None:
-    """Where a step of theta and the starts leads, of all windows; None where nothing is to be gained, or one diverges.
+) -> tuple[FloatArray, FloatArray] | None:
+    """Theta (N,) and starts (W, D) after a step downhill; None where nothing is to be gained.
 
-    Starts of windows that are not followed follow theta.
+    Starts of windows that are not followed are looked for anew there.
     """
     at = look.at
     step = _step(windows, look, at.held(prior), tuning).point
     if step is None:
         return None
-    point = _starts_at(windows, look.every, at, step.theta)
-    if not np.isfinite(point.residual[windows.observed]).all():
-        return None
-    starts = point.starts.copy()
+    starts = at.starts.copy()
     starts[at.kept] = step.starts
-    return WindowPoint(step.theta, starts, point.residual)
+    lost = np.setdiff1d(np.arange(windows.num_windows), at.kept)
+    return step.theta, regrown(windows, lost, step.theta, starts, at.noise, tuning)
+
+
+def regrown(
+    windows: Windows,
+    lost: IntArray,
+    theta: FloatArray,
+    starts: FloatArray,
+    noise: Noise,
+    tuning: FollowedTuning = FOLLOWED,
+) -> FloatArray:
+    """Starts (W, D) of which those of the windows that are lost (K,) are looked for anew, from their first moments on.
+
+    A search over the whole of a window ends in a wrong valley where it misses an impact; at a theta (N,) that is nearly
+    right, beginnings that grow meet one impact after the other.
+    """
+    starts = starts.copy()
+    if len(lost):
+        part, before = windows.part(lost), windows.rollouts
+        part.rollouts, part.budget = before, windows.budget
+        starts[lost] = grown_starts(part, theta, noise, _GROWING, tuning.first)
+        counted(windows, part, before)
+    return starts
 
 
 def _step(windows: Windows, look: FollowedLook, prior: QuadraticPrior, tuning: FollowedTuning) -> Descent[WindowPoint]:
@@ -150,7 +170,7 @@ def _step(windows: Windows, look: FollowedLook, prior: QuadraticPrior, tuning: F
     at, part, before = look.at, look.windows, windows.rollouts
     part.rollouts, part.budget = before, windows.budget
     energy, point = WindowEnergy(part, at.noise, prior), WindowPoint(at.theta, at.starts[at.kept], look.lin.residual)
-    linearised = ManyStarts(energy, point, part.moments(look.lin), _SHARES)
+    linearised = ManyStarts(energy, point, part.moments(look.lin), _GROWING.shares)
     descent = descend(linearised, _RULE.first, tuning.settled, _RULE)
     counted(windows, part, before)
     return descent
@@ -225,17 +245,3 @@ def _trimmed(lin: Linearisation, at: Followed) -> Linearisation:
     own = at.counted[at.kept]
     jacobian = np.where(own[..., None], lin.jacobian[at.kept], 0.0)
     return Linearisation(np.where(own, lin.residual[at.kept], 0.0), jacobian, True)
-
-
-def _starts_at(windows: Windows, lin: Linearisation, at: Followed, theta: FloatArray) -> WindowPoint:
-    """Starts at a theta (N,) that has moved: each takes the share of its own step that serves it best."""
-    n, white, precision = windows.num_theta, Noise(at.noise.sd, np.zeros_like(at.noise.tau)), windows.start_precision
-    left = (lin.residual - lin.jacobian[..., :n] @ (theta - at.theta)) / at.noise.sd
-    rows = lin.jacobian[..., n:] / at.noise.sd[:, None]
-    inner = np.einsum("wlci,wlcj->wij", rows, rows) + np.diag(precision)
-    force = np.einsum("wlci,wlc->wi", rows, left) - precision * at.starts
-    change = np.linalg.solve(inner, force[..., None])[..., 0]
-    change = np.where(np.isfinite(change), change, 0.0)  # of a window that all but diverges
-    energy = WindowEnergy(windows, white, QuadraticPrior(theta, np.zeros((n, n))))
-    point, moments = WindowPoint(at.theta, at.starts, lin.residual), windows.moments(lin, white=True)
-    return ManyStarts(energy, point, moments, _SHARES).simulated(theta, change)[0]

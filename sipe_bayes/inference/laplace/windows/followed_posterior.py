@@ -16,7 +16,7 @@ import numpy as np
 from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.laplace.windows.energy import updated_noise
-from sipe_bayes.inference.laplace.windows.followed import FollowedLook, agreement, followed_at, onward
+from sipe_bayes.inference.laplace.windows.followed import FollowedLook, agreement, followed_at, onward, regrown
 from sipe_bayes.inference.laplace.windows.growing_windows import Doubt, scatter_finding
 from sipe_bayes.inference.laplace.windows.optimum import Ending, sandwiches, summarised
 from sipe_bayes.inference.laplace.windows.state import WindowOptimum, WindowState
@@ -38,8 +38,13 @@ def followed_step(problem: SearchProblem, windows: Windows, state: WindowState) 
     if look is not None and here.iteration + 1 < tuning.rounds:
         step = onward(windows, look, prior, tuning)
     if look is not None and step is not None:
-        moved = replace(here, theta=step.theta, starts=step.starts, noise=look.at.noise, iteration=here.iteration + 1)
+        theta, starts = step
+        moved = replace(here, theta=theta, starts=starts, noise=look.at.noise, iteration=here.iteration + 1)
         return replace(state, here=moved)
+    if look is None and not here.iteration:
+        every = np.arange(windows.num_windows)
+        starts = regrown(windows, every, here.theta, here.starts, here.noise, tuning)
+        return replace(state, here=replace(here, starts=starts, iteration=1))
     (whole,), growing = state.optima, problem.options.tuning.growing
     end = whole
     doubt: Doubt | None = Doubt.FEW

@@ -201,17 +201,23 @@ def counted(windows: Windows, view: Windows, before: int) -> None:
     windows.rollouts = before + math.ceil((view.rollouts - before) * (view.steps.sum() / windows.steps.sum()))
 
 
-def grown_starts(windows: Windows, theta: FloatArray, noise: Noise, tuning: GrowingTuning) -> FloatArray:
-    """Starts (W, D) that fit best at a fixed theta (N,), found on beginnings that grow."""
-    starts, horizon = windows.no_starts(), first_horizon(windows, tuning)
+def grown_starts(
+    windows: Windows, theta: FloatArray, noise: Noise, tuning: GrowingTuning, first: int | None = None
+) -> FloatArray:
+    """Starts (W, D) that fit best at a fixed theta (N,), found on beginnings that grow, each for itself.
+
+    first: control steps of the first beginnings; default as ``tuning`` has it.
+    """
+    starts, horizon = windows.no_starts(), first or first_horizon(windows, tuning)
     white, flat = Noise(noise.sd, np.zeros_like(noise.tau)), QuadraticPrior(theta, np.zeros((len(theta), len(theta))))
     while True:
-        view = windows.beginnings(horizon)
+        view, before = windows.beginnings(horizon), windows.rollouts
+        view.rollouts, view.budget = before, windows.budget
         energy = WindowEnergy(view, white, flat)
         for _ in range(tuning.start_steps):
             lin = view.linearise(theta, starts, with_theta=False)
             if not lin.valid:
-                return starts
+                break
             moments = view.moments(lin, white=True)
             linearised = ManyStarts(energy, WindowPoint(theta, starts, lin.residual), moments, tuning.shares)
             change = marginal(moments, white, starts, view.start_precision)[1]
@@ -220,7 +226,8 @@ def grown_starts(windows: Windows, theta: FloatArray, noise: Noise, tuning: Grow
             starts = point.starts if gained > 0 else starts
             if gained < tuning.enough * linearised.energy:
                 break
-        if horizon >= windows.steps.max():
+        counted(windows, view, before)
+        if horizon >= windows.steps.max() or not lin.valid:
             return starts
         horizon = math.ceil(tuning.growth * horizon)
 
