@@ -26,7 +26,7 @@ from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.windows.followed import followed_windows
-from sipe_bayes.inference.laplace.windows.growing_windows import grows
+from sipe_bayes.inference.laplace.windows.growing_windows import Doubt, grows
 from sipe_bayes.inference.laplace.windows.state import Followed, WindowState
 from sipe_bayes.inference.random_effects import LogEstimate
 from sipe_bayes.inference.recorded import Tell, silent
@@ -226,4 +226,4 @@ def asked_windows(method: Estimator, fit: Fit, believed: Posterior) -> AskedWind
     some = spread_windows(fit.windows, MISFIT.steps)
     windows = fit.windows.part(some)
     look = followed_windows(windows, fit.theta, fit.starts[some], fit.noise, prior)
-    return None if look is None else AskedWindows.at(look.at, windows, prior, look.lin)
+    return None if isinstance(look, Doubt) else AskedWindows.at(look.at, windows, prior, look.lin)

@@ -93,6 +93,7 @@ class FollowedTuning(Options):
     settled: float = option(0.1, "that a step has to promise", "nats", above=0)
     fewest: int = option(4, "followed windows that say something", least=1)
     share: float = option(0.25, "of the windows that has to be followed: fewer are those that happen to fit", above=0)
+    loose: float = option(1.4, "of the samples' scatter: with so much noise hardly a window is followed", above=1)
     most: float = option(0.5, "of the windows, from which their optimum may be the posterior", above=0, most=1)
     apart: float = option(1e-3, "chance of groups of them as different, below which it is not", above=0, most=1)
 

@@ -36,7 +36,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule, Descent, descend
 from sipe_bayes.inference.laplace.options import FollowedTuning, GrowingTuning
 from sipe_bayes.inference.laplace.windows.energy import WindowEnergy, WindowPoint, updated_noise
-from sipe_bayes.inference.laplace.windows.growing_windows import ManyStarts, counted, grown_starts
+from sipe_bayes.inference.laplace.windows.growing_windows import Doubt, ManyStarts, counted, grown_starts, level
 from sipe_bayes.inference.laplace.windows.state import Followed
 from sipe_bayes.likelihood.noise import NORMAL_MAD, Noise, coefficients
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
@@ -65,7 +65,11 @@ class FollowedLook:
 
 def followed_cost(windows: Windows, tuning: FollowedTuning = FOLLOWED) -> int:
     """Rollouts of ``followed_windows`` as a rule, where no step is refused."""
-    each = 1 + 2 * windows.num_theta + windows.num_start + 2 * len(_GROWING.shares)
+    lost = (
+        0.2 * _GROWING.start_steps / (1 - 1 / _GROWING.growth)
+    )  # of a fifth of the windows, on ever longer beginnings
+    each = 1 + 2 * windows.num_theta + windows.num_start + len(_GROWING.shares)
+    each += round(lost * (1 + windows.num_start + len(_GROWING.shares)))
     return tuning.rounds * each * len(windows.trajectories)
 
 
@@ -76,7 +80,7 @@ def followed_windows(
     noise: Noise,
     prior: QuadraticPrior,
     tuning: FollowedTuning = FOLLOWED,
-) -> FollowedLook | None:
+) -> FollowedLook | Doubt:
     """Those of some windows that the model follows, with the noise that they have by themselves, at their own optimum.
 
     Costs up to ``tuning.rounds`` linearisations.
@@ -90,12 +94,16 @@ def followed_windows(
         tuning: which count as followed.
 
     Returns:
-        None where there are too few to say anything, or where they leave a channel out.
+        Why there are none, where they are too few to say anything or leave a channel out.
     """
     look = followed_at(windows, theta, starts, noise, prior, tuning)
-    for _ in range(tuning.rounds - 1):
-        step = None if look is None else onward(windows, look, prior, tuning)
-        if look is None or step is None:
+    for number in range(tuning.rounds - 1):
+        if look is Doubt.LOST and not number:
+            starts = regrown(windows, np.arange(windows.num_windows), theta, starts, noise, tuning)
+            look = followed_at(windows, theta, starts, noise, prior, tuning)
+            continue
+        step = None if isinstance(look, Doubt) else onward(windows, look, prior, tuning)
+        if isinstance(look, Doubt) or step is None:
             return look
         look = followed_at(windows, *step, look.at.noise, prior, tuning)
     return look
@@ -108,18 +116,19 @@ def followed_at(
     noise: Noise,
     prior: QuadraticPrior,
     tuning: FollowedTuning = FOLLOWED,
-) -> FollowedLook | None:
+) -> FollowedLook | Doubt:
     """Those that are followed at theta (N,) and starts (W, D); else as ``followed_windows``."""
     lin = windows.linearise(theta, starts)
     if not lin.valid:
-        return None
+        return Doubt.DIVERGES
     near, sd = _near(windows, lin.residual, noise.tau, tuning)
+    if near.any((1, 2)).sum() < tuning.share * windows.num_windows:
+        return Doubt.LOST
     near &= _smooth(windows, lin, theta, starts, sd, tuning)[:, None, None]
     at = Followed(near, theta, starts, Noise(sd, noise.tau))
-    if len(at.kept) < max(tuning.fewest, tuning.share * windows.num_windows):
-        return None
-    if not (near.any((0, 1)) | ~windows.observed.any((0, 1))).all():
-        return None
+    few = len(at.kept) < max(tuning.fewest, tuning.share * windows.num_windows)
+    if few or not (near.any((0, 1)) | ~windows.observed.any((0, 1))).all():
+        return Doubt.LOST if (sd > tuning.loose * level(windows).sd).any() else Doubt.FEW
     part, own, coloured = at.of(windows), _trimmed(lin, at), bool((noise.tau > 0).any())
     moments, held = part.moments(own), at.held(prior)
     noise = updated_noise(part, moments, at.noise, theta, starts[at.kept], held, coloured, False)

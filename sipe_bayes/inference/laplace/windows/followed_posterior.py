@@ -21,34 +21,42 @@ from sipe_bayes.inference.laplace.windows.growing_windows import Doubt, scatter_
 from sipe_bayes.inference.laplace.windows.optimum import Ending, sandwiches, summarised
 from sipe_bayes.inference.laplace.windows.state import WindowOptimum, WindowState
 from sipe_bayes.likelihood.restricted import eliminate_starts
+from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.windows import Windows
 
 
 def followed_step(problem: SearchProblem, windows: Windows, state: WindowState) -> WindowState:
     """A choice of windows and a step towards their optimum; at the last one, the search with what came of it.
 
+    Where the budget ends, that of the groups stands.
+
     Args:
         problem: what is searched.
         windows: all of them.
         state: whose only optimum has the scatter of groups.
     """
+    try:
+        return _step(problem, windows, state)
+    except BudgetExhausted:
+        windows.short = True
+        return replace(state, done=True)
+
+
+def _step(problem: SearchProblem, windows: Windows, state: WindowState) -> WindowState:
     here, prior, tuning = state.here, problem.quadratic_prior, problem.options.tuning.followed
     look = followed_at(windows, here.theta, here.starts, here.noise, prior, tuning)
-    step = None
-    if look is not None and here.iteration + 1 < tuning.rounds:
-        step = onward(windows, look, prior, tuning)
-    if look is not None and step is not None:
+    on = here.iteration + 1 < tuning.rounds
+    if look is Doubt.LOST and not here.iteration and on:
+        starts = regrown(windows, np.arange(windows.num_windows), here.theta, here.starts, here.noise, tuning)
+        return replace(state, here=replace(here, starts=starts, iteration=1))
+    step = None if isinstance(look, Doubt) or not on else onward(windows, look, prior, tuning)
+    if not isinstance(look, Doubt) and step is not None:
         theta, starts = step
         moved = replace(here, theta=theta, starts=starts, noise=look.at.noise, iteration=here.iteration + 1)
         return replace(state, here=moved)
-    if look is None and not here.iteration:
-        every = np.arange(windows.num_windows)
-        starts = regrown(windows, every, here.theta, here.starts, here.noise, tuning)
-        return replace(state, here=replace(here, starts=starts, iteration=1))
     (whole,), growing = state.optima, problem.options.tuning.growing
-    end = whole
-    doubt: Doubt | None = Doubt.FEW
-    if look is not None:
+    end, doubt = whole, look if isinstance(look, Doubt) else None
+    if not isinstance(look, Doubt):
         own = followed_optimum(problem, windows, whole, look)
         doubt = doubted(problem, windows, own, whole, look)
         end = own if doubt is None else replace(whole, followed=look.at)

@@ -35,7 +35,7 @@ from enum import StrEnum
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.findings import Code, Finding, Severity, finding
 from sipe_bayes.envs.poses import inertial_joints
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule, descend
 from sipe_bayes.inference.laplace.options import GrowingTuning
@@ -53,7 +53,9 @@ class Doubt(StrEnum):
     """Why the scatter of groups is the posterior, and not the optimum of the windows that are followed."""
 
     UNASKED = "the budget left no room to choose the windows that the model follows"
-    FEW = "the model follows too few windows"
+    DIVERGES = "the simulation diverges where the windows that the model follows were looked for"
+    LOST = "the model does not follow the windows, also from starts that are looked for anew"
+    FEW = "the model follows too few windows without jumps"
     SANDWICH = 'of the windows that the model follows nothing is known with noise = "sandwich"'
     UNSETTLED = "no search came to the optimum of the windows that the model follows"
     APART = "the windows that the model follows ask for different values"
@@ -272,9 +274,15 @@ def scattered(
 
 
 def scatter_finding(estimates: FloatArray, tuning: GrowingTuning, why: Doubt) -> Finding:
-    """That the normal is that of the scatter of groups' estimates (G, N), and why."""
-    lost = len(estimates) - len(_reliable(estimates, tuning))
-    return finding(Code.SCATTER, groups=len(estimates), lost=lost, why=why)
+    """That the normal is that of the scatter of groups' estimates (G, N), and why.
+
+    It blocks where the model follows hardly a window: what misses alike is off alike, and scatters little.
+    """
+    lost, severity = (
+        len(estimates) - len(_reliable(estimates, tuning)),
+        Severity.BLOCKING if why is Doubt.LOST else None,
+    )
+    return finding(Code.SCATTER, severity=severity, groups=len(estimates), lost=lost, why=why)
 
 
 def _reliable(estimates: FloatArray, tuning: GrowingTuning) -> FloatArray:
