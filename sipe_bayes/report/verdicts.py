@@ -17,6 +17,7 @@ from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.report.words import listed, number, significant
 
 _ONE = "The one value may be trusted within its interval"
+_UNTOLD = "if the numbers that no log tells are right"
 _NAMED, _DOUBTS = 3, 2  # parameters and doubts that a sentence lists
 _FIVE_TO_95 = 0.9 * math.sqrt(12)  # sds of a uniform prior
 
@@ -48,8 +49,21 @@ def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdic
     """What to think of one parameter: what is wrong with it, else how far the logs determine it.
 
     One that is poorly determined but belongs to a ridge is determined with the others of it. None is good while a
-    finding blocks.
+    finding blocks, or while a number that no log tells would move it.
     """
+    verdict = _of_the_logs(parameter, findings)
+    if verdict.tone == "good" and _hangs(parameter, findings):
+        return Verdict("fair", f"{verdict.text}, but for what no log tells")
+    return verdict
+
+
+def _hangs(parameter: ParameterSummary, findings: Findings) -> bool:
+    """Whether a number that no log tells would move it by more than the logs leave open."""
+    return any(item.code is Code.UNTOLD for item in findings.about(parameter.name))
+
+
+def _of_the_logs(parameter: ParameterSummary, findings: Findings) -> Verdict:
+    """The same as if all numbers that no log tells were right."""
     codes = {item.code for item in findings.about(parameter.name)}
     on_ridge = [r.parameters for r in findings.of(Code.RIDGE_TO_RESOLVE) if parameter.name in r.parameters]
     others = list(dict.fromkeys(n for names in on_ridge for n in names if n != parameter.name))
@@ -179,16 +193,20 @@ def headline(
         return Verdict("bad", f"No value may be trusted within its interval yet: {first}{others}.")
     if any(p.further is not None for p in wanted) and _lacks(findings):
         return _use(wanted, findings, bands, better)
-    good = [p.name for p in wanted if parameter_verdict(p, findings).tone == "good"]
+    good = [p for p in wanted if _of_the_logs(p, findings).tone == "good"]
     if not good:
         return Verdict("bad", "No value may be trusted within its interval; the table says why.")
     unasked = bool(findings.of(Code.MISFIT_NOT_ASKED, Code.WINDOWS_NOT_FOLLOWED))
-    if_right = ", if the model lacks nothing" if unasked else ""
+    hanging = [p.name for p in good if _hangs(p, findings)]
+    conditions = ["if the model lacks nothing"] if unasked else []
+    if hanging:
+        conditions.append(_UNTOLD if len(hanging) == len(wanted) else f"{_few(hanging)} only {_UNTOLD}")
+    given = "".join(f", {condition}" for condition in conditions)
     if len(good) == len(wanted):
         text = f"All {len(good)} values may be trusted within their intervals" if len(good) > 1 else _ONE
-        return Verdict("fair" if unasked else "good", f"{text}{if_right}.")
-    text = f"{len(good)} of {len(wanted)} values may be trusted within their intervals{if_right}: {_few(good)}"
-    return Verdict("fair", f"{text}; the table says why not the others.")
+        return Verdict("fair" if conditions else "good", f"{text}{given}.")
+    text = f"{len(good)} of {len(wanted)} values may be trusted within their intervals{given}: "
+    return Verdict("fair", f"{text}{_few([p.name for p in good])}; the table says why not the others.")
 
 
 def prediction(scores: Sequence[ChannelScore], comparison: Comparison | None) -> Verdict:

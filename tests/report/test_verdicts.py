@@ -235,6 +235,23 @@ def test_headline_counts_without_nuisance_parameters() -> None:
     assert judged.parameter_verdict(weak, doubts).text == "weakly determined; doubted above"
 
 
+def test_values_that_hang_on_numbers_that_no_log_tells_are_trusted_only_if_these_are_right() -> None:
+    """A stiffness is known but for a mass that only impacts tell; the other values are known without it."""
+    mass, other = parameter(0.9), dataclasses.replace(parameter(0.9), name="stiffness")
+    untold = Findings([noticed(Code.UNTOLD, "stiffness", severity=Severity.NOTE)])
+    expected = judged.Verdict("fair", "determined, but for what no log tells")
+    assert judged.parameter_verdict(other, untold) == expected
+    assert judged.parameter_verdict(mass, untold).tone == "good"
+    if_right = "if the numbers that no log tells are right"
+    words = f"All 2 values may be trusted within their intervals, stiffness only {if_right}."
+    assert judged.headline([mass, other], untold) == judged.Verdict("fair", words)
+    assert judged.headline([other, other], untold).text.endswith(f"intervals, {if_right}.")
+    few = judged.headline([mass, other, dataclasses.replace(parameter(0.5), name="weak")], untold)
+    assert few.text.startswith(f"2 of 3 values may be trusted within their intervals, stiffness only {if_right}: mass and ")
+    weak = dataclasses.replace(other, contraction=0.5)
+    assert judged.parameter_verdict(weak, untold).text == "weakly determined"
+
+
 def test_a_model_that_lacks_something_is_used_for_what_it_can_do() -> None:
     """Values whose wider interval still determines them, bands with what they hold; other doubts come first.
 
