@@ -53,7 +53,7 @@ def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdic
     """
     verdict = _of_the_logs(parameter, findings)
     if verdict.tone == "good" and _hangs(parameter, findings):
-        return Verdict("fair", f"{verdict.text}, but for what no log tells")
+        return Verdict("fair", f"{verdict.text}, see the note")
     return verdict
 
 
