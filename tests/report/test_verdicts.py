@@ -247,7 +247,9 @@ def test_values_that_hang_on_numbers_that_no_log_tells_are_trusted_only_if_these
     assert judged.headline([mass, other], untold) == judged.Verdict("fair", words)
     assert judged.headline([other, other], untold).text.endswith(f"intervals, {if_right}.")
     few = judged.headline([mass, other, dataclasses.replace(parameter(0.5), name="weak")], untold)
-    assert few.text.startswith(f"2 of 3 values may be trusted within their intervals, stiffness only {if_right}: mass and ")
+    assert few.text.startswith(
+        f"2 of 3 values may be trusted within their intervals, stiffness only {if_right}: mass and "
+    )
     weak = dataclasses.replace(other, contraction=0.5)
     assert judged.parameter_verdict(weak, untold).text == "weakly determined"
 

@@ -30,6 +30,9 @@ Deviations:
   draws of the null none are: p is too large there by as little as noise alone lies so far. Whether noise is larger for
   a while is not asked there: what is left of an impact is, also where the model is right.
 - Where dry friction holds the simulated joint still, a small step of what acts on it changes nothing, and says nothing.
+- Where the fit takes far more for noise than samples scatter by, that noise holds what the model lacks. It is asked
+  whether the residuals are noise beside it, but what they look like beside noise of that scatter: the probe that
+  explains most there is named, if it explains a tenth.
 - Where a probe's own statistic is beyond the null and the probe explains a tenth of the residual, it is named even if
   whiteness is odder, since it says more. Causes whose statistics are about as large are named together; one that is
   named fits best, it is not proven (``sipe discover`` fits them and compares).
@@ -90,6 +93,12 @@ class _Named:
             return float((1 + (largest >= odd[statistic]).sum()) / (1 + count))
 
         worst, k, floor = int(odd.argmax()), len(logs.probes), 1 / (1 + count)
+        scatter = logs.at_scatter
+        if k and scatter is not logs and p(worst) <= THRESHOLDS.misfit:
+            best = int((scatter.seen.score**2 / scatter.seen.information).argmax())
+            named = _Named(scatter, self.sd, self.estimate)._probe_named(p(worst), best, scatter.seen)
+            if max(named.share.values()) >= THRESHOLDS.small_misfit:
+                return replace(named, floor=floor)
         if k:
             best = int(odd[:k].argmax())
             named = replace(self._probe_named(p(worst), best, seen), floor=floor)

@@ -28,6 +28,7 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.diagnostics.misfit.whitened_rows import Products, WhitenedRows
 from sipe_bayes.diagnostics.thinning import spread_windows
+from sipe_bayes.inference.laplace.windows.growing_windows import level
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.block_tridiagonal import Eliminated
 from sipe_bayes.likelihood.moments import Moments
@@ -54,6 +55,7 @@ class MisfitOptions(Options):
     alike: float = option(0.8, "of the best probe's statistic, from which another cause is named beside it", least=0)
     causes: int = option(3, "that are named at most", least=1)
     steps: int = option(4000, "of windows spread evenly over long logs: each probe is a simulation", "control steps")
+    hides: float = option(1.4, "of the samples' scatter: from here on noise hides as much again", above=1)
     rounding: float = option(2.0, "of the simulation's rounding, below which noise is that", least=1)
     batch: int = option(20, "draws of the null whose products are formed together", least=1)
 
@@ -184,10 +186,27 @@ class ProbedLogs:
     @functools.cached_property
     def discounted(self) -> ProbedLogs:
         """The same logs, with samples that tell no more than they do beside those around them."""
+        return self._with(remembering(self.noise, self.memory))
+
+    @functools.cached_property
+    def at_scatter(self) -> ProbedLogs:
+        """The same logs with white noise of the samples' scatter in channels whose fit takes far more for noise.
+
+        That holds what a wrong model leaves, and hides what it is: slow noise passes for slow forces.
+        """
+        scatter = np.maximum(level(self.windows).sd, self.windows.rounding)
+        holds = scatter * MISFIT.hides < self.noise.sd
+        if not holds.any():
+            return self
+        noise = Noise(np.where(holds, scatter, self.noise.sd), np.where(holds, 0.0, self.noise.tau))
+        return self._with(noise)
+
+    def _with(self, noise: Noise) -> ProbedLogs:
+        """The same logs beside another noise."""
         out = copy.copy(self)
-        for name in ("arrow", "seen", "memory"):
+        for name in ("arrow", "seen", "memory", "discounted", "at_scatter"):
             out.__dict__.pop(name, None)
-        out.noise, out._nulls = remembering(self.noise, self.memory), {}
+        out.noise, out._nulls = noise, {}
         return out
 
     def null(self, seed: int, simulated: int) -> FloatArray:
