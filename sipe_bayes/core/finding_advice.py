@@ -116,7 +116,9 @@ ADVICE: dict[Code, str] = {
     ),
     Code.HELD_OUT_AT_REST: "Only the errors on held-out logs suffer. Measure the pose there too.",
     Code.SCATTER: (
-        "Nothing to do: the intervals are themselves uncertain by a third to a fifth. More tosses narrow them."
+        "A note needs nothing done: the intervals are themselves uncertain by a third to a fifth, and more tosses narrow "
+        "them. Where it blocks, the model does not follow the logs through their impacts: look at the law of contact "
+        "and at the masses of what is struck, try shorter windows (`window`), or `likelihood = 'state_space'`."
     ),
     Code.WINDOWS_LEFT_OUT: (
         "Nothing to do: the intervals are those of the other windows. Shorter windows lose less to an impact."

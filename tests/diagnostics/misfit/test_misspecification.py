@@ -129,6 +129,26 @@ def residuals(rho: float) -> ProbedLogs:
     return ProbedLogs(windows, theta, noise, best_starts(windows, theta, noise), flat)
 
 
+def test_what_a_fit_takes_for_slow_noise_is_named_beside_the_samples_scatter() -> None:
+    """Noise that is no larger than that hides nothing; beside slow noise dry friction is no more than that."""
+    logs = residuals(0.0)
+    assert logs.at_scatter is logs
+    simulator = pendulum()
+    recorded = Trajectories.stack(log(pendulum(FRICTION), [0.6, 0.08, 0.03], 2))
+    method = get_estimator(simulator, "laplace", restarts=1, candidates=0)
+    theta, windows = method.fit(recorded).mode.numpy(), bind(method.likelihood, simulator, recorded)
+    slow = ProbedLogs(windows, theta, Noise(np.array([0.1]), np.array([0.3])))
+    np.testing.assert_allclose(slow.at_scatter.noise.sd, 0.01, rtol=0.3)  # the log's
+    assert slow.at_scatter.noise.tau.tolist() == [0.0]
+    assert slow.noise.sd.tolist() == [0.1]
+    beside = misfit(slow, simulated=39)
+    assert beside.alarm
+    assert "friction at hinge" in beside.cause
+    assert beside.share["joint:hinge.position"] > 0.1
+    vars(slow)["at_scatter"] = slow
+    assert "friction" not in misfit(slow, simulated=39).cause
+
+
 def close(one: FloatArray, other: FloatArray) -> None:
     np.testing.assert_allclose(one, other, atol=1e-10 * np.abs(other).max())
 
