@@ -9,7 +9,7 @@ from sipe_bayes.core.finding_texts import Code
 _COMPARE = "Fit again with `--estimator mcmc` and compare the intervals."
 _REMEDY_LACKING = (
     "Run `sipe discover` on the same configuration; it puts in what explains the residuals, and says so. Through "
-    "impacts add what is named as parameters, fit again, and compare the held-out errors."
+    "impacts, where it refuses, add what is named as parameters, fit again, and compare the held-out errors."
 )
 _BOUNDS = (
     "Widen the bounds if the value could lie beyond. Where the bound is physical, zero friction for instance, the "
@@ -116,9 +116,11 @@ ADVICE: dict[Code, str] = {
     ),
     Code.HELD_OUT_AT_REST: "Only the errors on held-out logs suffer. Measure the pose there too.",
     Code.SCATTER: (
-        "A note needs nothing done: the intervals are themselves uncertain by a third to a fifth, and more tosses narrow "
-        "them. Where it blocks, the model does not follow the logs through their impacts: look at the law of contact "
-        "and at the masses of what is struck, try shorter windows (`window`), or `likelihood = 'state_space'`."
+        "Nothing to do: the intervals are themselves uncertain by a third to a fifth. More tosses narrow them."
+    ),
+    Code.WINDOWS_LOST: (
+        "Look at the law of contact and at the masses of what is struck, try shorter windows (`window`), or "
+        "`likelihood = 'state_space'`."
     ),
     Code.WINDOWS_LEFT_OUT: (
         "Nothing to do: the intervals are those of the other windows. Shorter windows lose less to an impact."

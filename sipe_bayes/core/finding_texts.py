@@ -60,9 +60,7 @@ class Code(Enum):
         "the budget of {budget} rollouts ran out before the method had converged: give a larger one; laplace "
         "goes on with it in the same folder"
     )
-    AT_BOUND = caution(
-        "{parameters} at a bound: the truth may lie beyond it; widen the bounds, or look at the residuals"
-    )
+    AT_BOUND = caution("{parameters} at a bound: the truth may lie beyond; widen the bounds, or look at the residuals")
     NOT_MIXED = blocking(
         "the {what} have not mixed (R-hat {rhat:.3f}, {ess:.0f} effective{unit}): {remedy} before you trust the "
         "intervals"
@@ -189,6 +187,10 @@ class Code(Enum):
         "impacts make the simulation rough, and {why}: the intervals are those of the scatter of {groups} groups of "
         "windows fitted apart ({lost} of them lost)"
     )
+    WINDOWS_LOST = blocking(
+        "the model does not follow the windows through impacts, or leaves more than the samples scatter by: what "
+        "misses alike is off alike, so that nothing says by how much"
+    )
     WINDOWS_LEFT_OUT = note("{left} of {windows} windows tell nothing: the model misses impacts there, or jumps there")
     SCATTER_UNKNOWN = blocking(
         "impacts make the simulation rough, and {windows} windows are too few to see by their scatter how well the "
@@ -217,9 +219,7 @@ class Code(Enum):
     )
 
     # mcmc
-    NONLINEAR_STARTS = caution(
-        "the windows' starts are strongly nonlinear (error {error:.2f} nats): use shorter windows"
-    )
+    NONLINEAR_STARTS = caution("the windows' starts are strongly nonlinear ({error:.2f} nats): use shorter windows")
     NONLINEAR_STATES = caution(
         "the states are strongly nonlinear (error {error:.2f} nats): hold the intervals against those of laplace"
     )
@@ -271,9 +271,7 @@ class Code(Enum):
         "sample were fitted, hardly where the motion goes"
     )
     MISFIT_NOT_ASKED = note("whether the residuals are noise is not asked: the model follows too few windows, or slips")
-    WINDOWS_NOT_FOLLOWED = note(
-        "only {followed} of {windows} windows, which the model follows, were asked what it lacks"
-    )
+    WINDOWS_NOT_FOLLOWED = note("only {followed} of {windows} windows are followed, and asked what the model lacks")
     NOISE_FREE = note(
         "the model explains the logs but for {share:.0e} of what they move, as where they were simulated without "
         "noise: what is left is rounding, and says nothing of the model; the intervals are those of rounding too"

@@ -53,13 +53,13 @@ def parameter_verdict(parameter: ParameterSummary, findings: Findings) -> Verdic
     """
     verdict = _of_the_logs(parameter, findings)
     if verdict.tone == "good" and _hangs(parameter, findings):
-        return Verdict("fair", f"{verdict.text}, see the note")
+        return Verdict("fair", f"{verdict.text}; see note")
     return verdict
 
 
 def _hangs(parameter: ParameterSummary, findings: Findings) -> bool:
     """Whether a number that no log tells would move it by more than the logs leave open."""
-    return any(item.code is Code.UNTOLD for item in findings.about(parameter.name))
+    return any(parameter.name in item.parameters for item in findings.of(Code.UNTOLD))
 
 
 def _of_the_logs(parameter: ParameterSummary, findings: Findings) -> Verdict:
@@ -200,8 +200,8 @@ def headline(
     hanging = [p.name for p in good if _hangs(p, findings)]
     conditions = ["if the model lacks nothing"] if unasked else []
     if hanging:
-        conditions.append(_UNTOLD if len(hanging) == len(wanted) else f"{_few(hanging)} only {_UNTOLD}")
-    given = "".join(f", {condition}" for condition in conditions)
+        conditions.append(_UNTOLD if len(hanging) == len(good) else f"{_few(hanging)} only {_UNTOLD}")
+    given = f", {' and '.join(conditions)}" if conditions else ""
     if len(good) == len(wanted):
         text = f"All {len(good)} values may be trusted within their intervals" if len(good) > 1 else _ONE
         return Verdict("fair" if conditions else "good", f"{text}{given}.")

@@ -239,7 +239,7 @@ def test_values_that_hang_on_numbers_that_no_log_tells_are_trusted_only_if_these
     """A stiffness is known but for a mass that only impacts tell; the other values are known without it."""
     mass, other = parameter(0.9), dataclasses.replace(parameter(0.9), name="stiffness")
     untold = Findings([noticed(Code.UNTOLD, "stiffness", severity=Severity.NOTE)])
-    expected = judged.Verdict("fair", "determined, see the note")
+    expected = judged.Verdict("fair", "determined; see note")
     assert judged.parameter_verdict(other, untold) == expected
     assert judged.parameter_verdict(mass, untold).tone == "good"
     if_right = "if the numbers that no log tells are right"

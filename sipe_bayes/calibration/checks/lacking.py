@@ -197,7 +197,7 @@ def groups_apart(method: Estimator, posterior: Posterior) -> list[LogEstimate]:
         posterior: of it, which is that of their mean.
     """
     search = method.state.search if isinstance(method, Laplace) and method.state is not None else None
-    if not isinstance(search, WindowState) or not Findings(method.findings).of(Code.SCATTER):
+    if not isinstance(search, WindowState) or not Findings(method.findings).of(Code.SCATTER, Code.WINDOWS_LOST):
         return []
     information = np.diag(1 / (len(search.estimates) * np.maximum(posterior.stddev.numpy(), 1e-12) ** 2))
     return [LogEstimate(f"group {k}", theta, information) for k, theta in enumerate(search.estimates)]

@@ -26,6 +26,8 @@ Deviations:
 - A column is taken only where it raises the log evidence by ``gain``, and ``causes`` at most: there are dozens, and a
   dozen of them together would explain anything.
 - The noise is estimated anew with the columns that were taken, in turns.
+- Through impacts the causes that are taken move theta by normal shares of what they do to first order, with an sd of
+  ``unsure``: there corrections were in the right direction, and half as far as it takes.
 - Gains that differ between logs are not taken: they would explain why logs differ, which the spread is to hold.
 """
 
@@ -43,6 +45,7 @@ from sipe_bayes.diagnostics.agreement import linear_estimates, parts_of
 from sipe_bayes.diagnostics.misfit.library_discrepancy import library_discrepancy
 from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs, oddness, remembering
 from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances, named, untold, widened
+from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.inference.random_effects import LogEstimate, random_effects
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
@@ -58,6 +61,7 @@ class MissingPhysicsOptions(Options):
     causes: int = option(4, "columns that are taken at most: a dozen small ones together explain anything", least=1)
     rounds: int = option(3, "in which causes and noise are estimated in turn", least=1)
     most: int = option(300, "steps of the search for causes", least=1)
+    unsure: float = option(1.0, "sd of how far causes move theta through impacts, of that to first order", least=0)
 
 
 _OPTIONS = MissingPhysicsOptions()
@@ -228,6 +232,9 @@ class _Causes:
         sizes = np.tile(self.sizes(logs), (len(theta), 1))
         sizes[:, self.kept] += away
         theta = theta + away @ self.response.T + logs.traded(sizes)
+        if grows(logs.windows):  # slopes between impacts tell the direction better than how far it goes
+            far = _OPTIONS.unsure * random.standard_normal((len(theta), 1))
+            theta = theta + far * (self.response @ self.sizes(logs)[self.kept])
         return Particles(np.clip(theta, 0, 1), further.space, weights=further.weights.numpy())
 
 

@@ -93,8 +93,8 @@ class _Named:
             return float((1 + (largest >= odd[statistic]).sum()) / (1 + count))
 
         worst, k, floor = int(odd.argmax()), len(logs.probes), 1 / (1 + count)
-        scatter = logs.at_scatter
-        if k and scatter is not logs and p(worst) <= THRESHOLDS.misfit:
+        bursts = worst >= k + len(logs.noise.sd)
+        if k and not bursts and p(worst) <= THRESHOLDS.misfit and (scatter := logs.at_scatter) is not logs:
             best = int((scatter.seen.score**2 / scatter.seen.information).argmax())
             named = _Named(scatter, self.sd, self.estimate)._probe_named(p(worst), best, scatter.seen)
             if max(named.share.values()) >= THRESHOLDS.small_misfit:

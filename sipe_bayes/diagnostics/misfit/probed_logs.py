@@ -194,8 +194,9 @@ class ProbedLogs:
 
         That holds what a wrong model leaves, and hides what it is: slow noise passes for slow forces.
         """
-        scatter = np.maximum(level(self.windows).sd, self.windows.rounding)
-        holds = scatter * MISFIT.hides < self.noise.sd
+        scatter = level(self.windows).sd
+        rests = scatter < MISFIT.rounding * self.windows.rounding
+        holds = (scatter * MISFIT.hides < self.noise.sd) & ~rests
         if not holds.any():
             return self
         noise = Noise(np.where(holds, scatter, self.noise.sd), np.where(holds, 0.0, self.noise.tau))

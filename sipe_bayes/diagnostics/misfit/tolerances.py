@@ -125,7 +125,9 @@ def tolerance_findings(logs: ProbedLogs, numbers: Sequence[Untold]) -> list[Find
     moved = np.flatnonzero(np.abs(shifts).max(0) > sd).tolist()
     ends = space.values(np.clip([logs.theta - off, logs.theta, logs.theta + off], 0, 1))
     by = [f"{space[j].name} by {np.abs(np.diff(ends[:, j])).max():.2g} {space[j].unit}" for j in moved]
-    names = [space[j].name for j in moved]
+    others = [one for one in numbers if one.probe.extension is not PHYSICS_STEP]  # the interval allows for steps
+    hangs = np.abs([one.shift for one in others]).max(0) > sd if others else np.zeros(len(space), bool)
+    names = [space[j].name for j in np.flatnonzero(hangs).tolist()]
     return [finding(Code.UNTOLD, parameters=names, causes=" or ".join(causes), moved=", ".join(by))]
 
 

@@ -94,6 +94,7 @@ class FollowedTuning(Options):
     fewest: int = option(4, "followed windows that say something", least=1)
     share: float = option(0.25, "of the windows that has to be followed: fewer are those that happen to fit", above=0)
     loose: float = option(1.4, "of the samples' scatter: with so much noise hardly a window is followed", above=1)
+    moves: float = option(2.0, "of the simulation's rounding: a channel that scatters less rests", above=0)
     most: float = option(0.5, "of the windows, from which their optimum may be the posterior", above=0, most=1)
     apart: float = option(1e-3, "chance of groups of them as different, below which it is not", above=0, most=1)
 

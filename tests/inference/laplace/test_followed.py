@@ -8,30 +8,22 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from sipe_bayes.calibration.checks.fitted import Fit
 from sipe_bayes.calibration.checks.lacking import AskedWindows, asked_windows
-from sipe_bayes.core.findings import Code, Severity, finding
-from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.evaluate import best_starts
+from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
-from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.options import FollowedTuning, GrowingTuning, LaplaceOptions, LaplaceTuning
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.laplace.windows import followed_posterior
 from sipe_bayes.inference.laplace.windows.followed import (
-    FOLLOWED,
     FollowedLook,
     agreement,
     followed_at,
-    followed_windows,
     onward,
-    regrown,
 )
 from sipe_bayes.inference.laplace.windows.followed_posterior import doubted
-from sipe_bayes.inference.laplace.windows.growing_windows import Doubt, scatter_finding
+from sipe_bayes.inference.laplace.windows.growing_windows import Doubt
 from sipe_bayes.inference.laplace.windows.state import Followed, WindowOptimum, WindowState
 from sipe_bayes.inference.mcmc import MCMC
 from sipe_bayes.likelihood.noise import Noise
@@ -39,59 +31,7 @@ from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 from sipe_bayes.posterior import GaussianMixture, prior
-from sipe_bayes.simulation.simulator import Simulator
-
-BUFFERS = """<mujoco><option timestep=".005"/><worldbody>
-<body name="ram"><joint name="ram" type="slide" axis="1 0 0" damping="2" frictionloss="{friction}"/>
-<geom type="box" size=".05 .05 .05" mass=".8"/></body>
-<body name="block" pos=".14 0 0"><joint name="block" type="slide" axis="1 0 0" damping="1" stiffness="30"/>
-<geom type="box" size=".05 .05 .05" mass=".5"/></body></worldbody>
-<actuator><motor name="push" joint="ram" gear="4"/></actuator></mujoco>"""
-TRUTH, NOISE, DT = np.array([0.4, 0.6]), np.array([3e-4, 3e-4]), 0.01
-CHANNELS = ("joint:ram.position", "joint:block.position")
-
-
-def machine(friction: float = 0.0) -> Simulator:
-    """A ram that strikes a sprung block."""
-    unknown = [
-        Parameter("ram_damping", 0.5, 4.0, targets=("joint:ram.damping",)),
-        Parameter("block_mass", 0.2, 1.0, targets=("body:block.mass",)),
-    ]
-    return Simulator(
-        MjcfEnvironment.build(BUFFERS.format(friction=friction), unknown, ["push"], CHANNELS), num_threads=1
-    )
-
-
-def recorded(friction: float = 0.0, seed: int = 0, count: int = 4) -> Trajectories:
-    """Logs of 1.2 s."""
-    engine, random, logs = machine(friction), np.random.default_rng(seed), []
-    for k in range(count):
-        tones = np.sin(2 * np.pi * random.uniform(0.5, 2.0, 3) * DT * np.arange(120)[:, None] + random.uniform(0, 6, 3))
-        command = tones.mean(1, keepdims=True)
-        clean = engine.rollout(TRUTH[None], command[None], engine.default_state()[None], DT).observations[0]
-        noisy = clean + NOISE * random.standard_normal(clean.shape)
-        logs.append(Trajectory(noisy, command, DT, name=f"log {k}", channels=CHANNELS))
-    return Trajectories.stack(logs)
-
-
-def everything(logs: Trajectories, theta: np.ndarray = TRUTH) -> Fit:
-    """All windows of logs, from their best starts."""
-    white, windows = Noise(NOISE, np.zeros(2)), Windows(Segments(0.2, "white"), machine(), logs)
-    return Fit(windows, theta, white, best_starts(windows, theta, white), False)
-
-
-def look_at(fit: Fit, tuning: FollowedTuning = FOLLOWED) -> FollowedLook | Doubt:
-    """What is followed of it."""
-    believed = QuadraticPrior.of(prior(fit.windows.simulator.space))
-    return followed_windows(fit.windows, fit.theta, fit.starts, fit.noise, believed, tuning)
-
-
-def changed(logs: Trajectories, samples: list[tuple[int, slice, float]]) -> Trajectories:
-    """Logs of which some samples of the block are so many metres off."""
-    observations = logs.observations.copy()
-    for log, where, by in samples:
-        observations[log, where, 1] += by
-    return replace(logs, observations=observations)
+from tests.problems.buffers import NOISE, TRUTH, changed, everything, look_at, machine, recorded
 
 
 def test_what_is_not_followed_is_left_out_and_theta_goes_where_the_others_are() -> None:
@@ -153,33 +93,6 @@ def test_few_windows_say_nothing() -> None:
     given = everything(recorded(count=1))
     assert look_at(given, FollowedTuning(fewest=7, differs=1e9)) is Doubt.FEW
     assert isinstance(look_at(given, FollowedTuning(fewest=6, differs=1e9)), FollowedLook)
-
-
-def test_few_windows_without_jumps_are_few_and_those_of_another_motion_lost() -> None:
-    """Where simulations jump in all: what they leave is noise, or it hides a motion that the model does not have."""
-    logs, rough = recorded(), FollowedTuning(differs=1e-9, matters=1e-9)
-    assert look_at(everything(logs), rough) is Doubt.FEW
-    observations = logs.observations.copy()
-    observations[..., 1] += 4 * NOISE[1] * np.sin(0.8 * np.arange(121))
-    other = everything(replace(logs, observations=observations))
-    assert look_at(other, rough) is Doubt.LOST
-    assert look_at(other, replace(rough, loose=100.0)) is Doubt.FEW
-
-
-def test_lost_windows_are_followed_again_from_starts_that_are_looked_for_anew() -> None:
-    """Of starts far off those that are found again; the others stay, and what it took is counted."""
-    given = everything(recorded())
-    windows, far = given.windows, given.starts.copy()
-    lost = np.arange(0, 24, 3)
-    far[lost] += [0.02, 0.02, 0.5, 0.5]
-    before = windows.rollouts
-    again = regrown(windows, lost, TRUTH, far, given.noise)
-    kept = np.setdiff1d(np.arange(24), lost)
-    np.testing.assert_array_equal(again[kept], given.starts[kept])
-    left = (windows.residuals(TRUTH[None], again[None])[0][0] / NOISE) ** 2
-    assert (left.sum((1, 2))[lost] < scipy.stats.chi2.isf(1e-4, 40)).all()
-    assert 4 * 20 < windows.rollouts - before < 4 * 300  # of a third of the windows, on beginnings
-    np.testing.assert_array_equal(regrown(windows, lost[:0], TRUTH, far, given.noise), far)
 
 
 def test_a_channel_that_no_followed_window_has_leaves_nothing_to_ask() -> None:
@@ -271,27 +184,6 @@ def test_what_does_not_stand_leaves_the_scatter_and_says_why() -> None:
     assert not best.trims
     np.testing.assert_array_equal(best.judged_sd, best.sd)
     assert any(f.code is Code.SCATTER and str(Doubt.FEW) in f.text for f in method.findings)
-
-
-def test_a_budget_that_ends_meanwhile_leaves_the_scatter() -> None:
-    """All but a few rollouts of what the fit takes by itself: groups have been fitted, the windows not all chosen."""
-    tuning = LaplaceTuning(growing=GrowingTuning(rough=1.0001))
-    logs = changed(recorded(), [(0, slice(28, 40), 0.02), (2, slice(68, 80), 0.02)])
-    whole = Laplace(machine(), likelihood=Segments(0.2, "white"), tuning=tuning)
-    whole.fit(logs)
-    method = Laplace(machine(), likelihood=Segments(0.2, "white"), tuning=tuning, budget=whole.rollouts - 40)
-    method.fit(logs)
-    (noticed,) = method.findings
-    assert noticed.code is Code.SCATTER
-    assert str(Doubt.UNASKED) in noticed.text
-
-
-def test_groups_of_windows_that_are_lost_block() -> None:
-    """What misses alike is off alike."""
-    estimates = np.random.default_rng(0).normal(0.5, 0.01, (8, 2))
-    severities = {why: scatter_finding(estimates, GrowingTuning(), why).severity for why in Doubt}
-    assert severities.pop(Doubt.LOST) is Severity.BLOCKING
-    assert set(severities.values()) == {Severity.NOTE}
 
 
 @pytest.mark.parametrize("noise", ["ar1", "sandwich"])

@@ -7,7 +7,7 @@ But most windows are followed, and around their own optimum they change as smoot
 
 So theta is moved to the optimum of the windows that are followed, as in least trimmed squares (P. Rousseeuw, "Least
 median of squares regression", 1984, https://doi.org/10.1080/01621459.1984.10477105): choose them, take a step with
-their starts, let the other windows' starts follow, choose again.
+their starts, look for the other windows' starts anew, from their first moments on, choose again.
 
 Samples that lie far from the others, by robust sds of their channel, are those of an impact that is met a little
 late, or of a body that chatters where it lies; they are left out, and the windows where they are many. Noise that lets
@@ -36,7 +36,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule, Descent, descend
 from sipe_bayes.inference.laplace.options import FollowedTuning, GrowingTuning
 from sipe_bayes.inference.laplace.windows.energy import WindowEnergy, WindowPoint, updated_noise
-from sipe_bayes.inference.laplace.windows.growing_windows import Doubt, ManyStarts, counted, grown_starts, level
+from sipe_bayes.inference.laplace.windows.growing_windows import Doubt, ManyStarts, counted, grown_starts, lent, level
 from sipe_bayes.inference.laplace.windows.state import Followed
 from sipe_bayes.likelihood.noise import NORMAL_MAD, Noise, coefficients
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
@@ -44,6 +44,7 @@ from sipe_bayes.likelihood.restricted import eliminate_starts
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 
 FOLLOWED, _GROWING, _RULE = FollowedTuning(), GrowingTuning(), DampingRule()
+_LOST = 0.2  # share of the windows that is looked for anew, as a rule
 
 
 @dataclass(frozen=True)
@@ -65,11 +66,9 @@ class FollowedLook:
 
 def followed_cost(windows: Windows, tuning: FollowedTuning = FOLLOWED) -> int:
     """Rollouts of ``followed_windows`` as a rule, where no step is refused."""
-    lost = (
-        0.2 * _GROWING.start_steps / (1 - 1 / _GROWING.growth)
-    )  # of a fifth of the windows, on ever longer beginnings
-    each = 1 + 2 * windows.num_theta + windows.num_start + len(_GROWING.shares)
-    each += round(lost * (1 + windows.num_start + len(_GROWING.shares)))
+    start_step = 1 + windows.num_start + len(_GROWING.shares)
+    whole = _GROWING.start_steps / (1 - 1 / _GROWING.growth)  # steps that those on all beginnings of a window make
+    each = 1 + 2 * windows.num_theta + windows.num_start + len(_GROWING.shares) + round(_LOST * whole * start_step)
     return tuning.rounds * each * len(windows.trajectories)
 
 
@@ -83,7 +82,7 @@ def followed_windows(
 ) -> FollowedLook | Doubt:
     """Those of some windows that the model follows, with the noise that they have by themselves, at their own optimum.
 
-    Costs up to ``tuning.rounds`` linearisations.
+    Costs up to ``tuning.rounds`` linearisations, and the search for the starts of windows that are not (``regrown``).
 
     Args:
         windows: from which they are chosen.
@@ -99,8 +98,10 @@ def followed_windows(
     look = followed_at(windows, theta, starts, noise, prior, tuning)
     for number in range(tuning.rounds - 1):
         if look is Doubt.LOST and not number:
-            starts = regrown(windows, np.arange(windows.num_windows), theta, starts, noise, tuning)
-            look = followed_at(windows, theta, starts, noise, prior, tuning)
+            again = regrown(windows, np.arange(windows.num_windows), theta, starts, noise, tuning)
+            if again is None:
+                return look
+            look = followed_at(windows, theta, again, noise, prior, tuning)
             continue
         step = None if isinstance(look, Doubt) else onward(windows, look, prior, tuning)
         if isinstance(look, Doubt) or step is None:
@@ -128,7 +129,7 @@ def followed_at(
     at = Followed(near, theta, starts, Noise(sd, noise.tau))
     few = len(at.kept) < max(tuning.fewest, tuning.share * windows.num_windows)
     if few or not (near.any((0, 1)) | ~windows.observed.any((0, 1))).all():
-        return Doubt.LOST if (sd > tuning.loose * level(windows).sd).any() else Doubt.FEW
+        return Doubt.LOST if _loose(windows, sd, tuning) else Doubt.FEW
     part, own, coloured = at.of(windows), _trimmed(lin, at), bool((noise.tau > 0).any())
     moments, held = part.moments(own), at.held(prior)
     noise = updated_noise(part, moments, at.noise, theta, starts[at.kept], held, coloured, False)
@@ -136,9 +137,13 @@ def followed_at(
 
 
 def onward(
-    windows: Windows, look: FollowedLook, prior: QuadraticPrior, tuning: FollowedTuning = FOLLOWED
+    windows: Windows,
+    look: FollowedLook,
+    prior: QuadraticPrior,
+    tuning: FollowedTuning = FOLLOWED,
+    growing: GrowingTuning = _GROWING,
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Theta (N,) and starts (W, D) after a step downhill; None where nothing is to be gained.
+    """Theta (N,) and starts (W, D) after a step downhill; None where nothing is to be gained, or a window diverges.
 
     Starts of windows that are not followed are looked for anew there.
     """
@@ -146,10 +151,11 @@ def onward(
     step = _step(windows, look, at.held(prior), tuning).point
     if step is None:
         return None
-    starts = at.starts.copy()
-    starts[at.kept] = step.starts
+    moved = at.starts.copy()
+    moved[at.kept] = step.starts
     lost = np.setdiff1d(np.arange(windows.num_windows), at.kept)
-    return step.theta, regrown(windows, lost, step.theta, starts, at.noise, tuning)
+    starts = regrown(windows, lost, step.theta, moved, at.noise, tuning, growing)
+    return None if starts is None else (step.theta, starts)
 
 
 def regrown(
@@ -159,25 +165,34 @@ def regrown(
     starts: FloatArray,
     noise: Noise,
     tuning: FollowedTuning = FOLLOWED,
-) -> FloatArray:
+    growing: GrowingTuning = _GROWING,
+) -> FloatArray | None:
     """Starts (W, D) of which those of the windows that are lost (K,) are looked for anew, from their first moments on.
 
     A search over the whole of a window ends in a wrong valley where it misses an impact; at a theta (N,) that is nearly
-    right, beginnings that grow meet one impact after the other.
+    right, beginnings that grow meet one impact after the other. Each window keeps the start that fits it better; None
+    where one diverges from both.
     """
     starts = starts.copy()
-    if len(lost):
-        part, before = windows.part(lost), windows.rollouts
-        part.rollouts, part.budget = before, windows.budget
-        starts[lost] = grown_starts(part, theta, noise, _GROWING, tuning.first)
+    if not len(lost):
+        return starts
+    part = windows.part(lost)
+    before = lent(windows, part)
+    try:
+        tried = np.stack([starts[lost], grown_starts(part, theta, noise, growing, tuning.first)])
+        predicted, _ = part.predict(np.tile(theta, (2, 1)), tried)
+    finally:
         counted(windows, part, before)
-    return starts
+    residual = np.where(part.observed, (part.measured - predicted) / noise.sd, 0.0)
+    square = np.nan_to_num((residual**2).sum((2, 3)), nan=np.inf)  # NaN where a window diverged
+    starts[lost] = tried[square.argmin(0), np.arange(len(lost))]
+    return starts if np.isfinite(square.min(0)).all() else None
 
 
 def _step(windows: Windows, look: FollowedLook, prior: QuadraticPrior, tuning: FollowedTuning) -> Descent[WindowPoint]:
     """A step downhill of theta and the starts of what is followed."""
-    at, part, before = look.at, look.windows, windows.rollouts
-    part.rollouts, part.budget = before, windows.budget
+    at, part = look.at, look.windows
+    before = lent(windows, part)
     energy, point = WindowEnergy(part, at.noise, prior), WindowPoint(at.theta, at.starts[at.kept], look.lin.residual)
     linearised = ManyStarts(energy, point, part.moments(look.lin), _GROWING.shares)
     descent = descend(linearised, _RULE.first, tuning.settled, _RULE)
@@ -231,6 +246,12 @@ def _near(
     mean = np.where(near, residual**2, 0.0).sum(1) / np.maximum(some, 1)
     followed = (every == 0) | ((mean <= sd**2 * most) & (every - some <= tuning.most_far * every))
     return near & followed.all(1)[:, None, None], sd
+
+
+def _loose(windows: Windows, sd: FloatArray, tuning: FollowedTuning) -> bool:
+    """Whether noise sds (C,) hide as much as the samples scatter by; not of a channel that rests."""
+    scatter = level(windows).sd
+    return bool(((scatter > tuning.moves * windows.rounding) & (sd > tuning.loose * scatter)).any())
 
 
 def _smooth(

@@ -4,7 +4,8 @@ Around their own optimum (``followed``) these windows change as smoothly as thei
 how well theta is known. It stands in the place of the scatter of groups of windows (``growing_windows``), which is that
 of the wrong valleys in which their searches end, and far wider; unless few windows are followed, they ask for different
 values where the model lacks something (``followed.agreement``), the search for their optimum has not come to an end,
-or they tell less than the scatter does. Which of these it is, is a ``Doubt``.
+diverges or has no budget left, or they tell less than the scatter does. Which of these it is, is a ``Doubt``. Where the
+model does not follow the windows at all, a finding blocks: what misses alike is off alike, and scatters little.
 """
 
 from __future__ import annotations
@@ -38,29 +39,36 @@ def followed_step(problem: SearchProblem, windows: Windows, state: WindowState) 
     try:
         return _step(problem, windows, state)
     except BudgetExhausted:
+        if not state.optima[0].scatters:
+            raise
         windows.short = True
         return replace(state, done=True)
 
 
 def _step(problem: SearchProblem, windows: Windows, state: WindowState) -> WindowState:
-    here, prior, tuning = state.here, problem.quadratic_prior, problem.options.tuning.followed
+    here, prior = state.here, problem.quadratic_prior
+    tuning, growing = problem.options.tuning.followed, problem.options.tuning.growing
     look = followed_at(windows, here.theta, here.starts, here.noise, prior, tuning)
     on = here.iteration + 1 < tuning.rounds
     if look is Doubt.LOST and not here.iteration and on:
-        starts = regrown(windows, np.arange(windows.num_windows), here.theta, here.starts, here.noise, tuning)
-        return replace(state, here=replace(here, starts=starts, iteration=1))
-    step = None if isinstance(look, Doubt) or not on else onward(windows, look, prior, tuning)
+        every = np.arange(windows.num_windows)
+        again = regrown(windows, every, here.theta, here.starts, here.noise, tuning, growing)
+        if again is not None:
+            return replace(state, here=replace(here, starts=again, iteration=1))
+    step = None if isinstance(look, Doubt) or not on else onward(windows, look, prior, tuning, growing)
     if not isinstance(look, Doubt) and step is not None:
         theta, starts = step
         moved = replace(here, theta=theta, starts=starts, noise=look.at.noise, iteration=here.iteration + 1)
         return replace(state, here=moved)
-    (whole,), growing = state.optima, problem.options.tuning.growing
+    (whole,) = state.optima
     end, doubt = whole, look if isinstance(look, Doubt) else None
     if not isinstance(look, Doubt):
         own = followed_optimum(problem, windows, whole, look)
         doubt = doubted(problem, windows, own, whole, look)
         end = own if doubt is None else replace(whole, followed=look.at)
-    if doubt is not None and whole.scatters:
+    if doubt is Doubt.LOST:
+        end = replace(whole, finding=finding(Code.WINDOWS_LOST))
+    elif doubt is not None and whole.scatters:
         end = replace(end, finding=scatter_finding(np.stack(state.estimates), growing, doubt))
     return replace(state, optima=(end,), done=True)
 

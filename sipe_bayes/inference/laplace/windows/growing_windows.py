@@ -35,7 +35,7 @@ from enum import StrEnum
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.findings import Code, Finding, Severity, finding
+from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.envs.poses import inertial_joints
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule, descend
 from sipe_bayes.inference.laplace.options import GrowingTuning
@@ -54,8 +54,8 @@ class Doubt(StrEnum):
 
     UNASKED = "the budget left no room to choose the windows that the model follows"
     DIVERGES = "the simulation diverges where the windows that the model follows were looked for"
-    LOST = "the model does not follow the windows, also from starts that are looked for anew"
-    FEW = "the model follows too few windows without jumps"
+    LOST = "the model does not follow the windows"
+    FEW = "the model follows too few windows, or jumps there"
     SANDWICH = 'of the windows that the model follows nothing is known with noise = "sandwich"'
     UNSETTLED = "no search came to the optimum of the windows that the model follows"
     APART = "the windows that the model follows ask for different values"
@@ -198,6 +198,13 @@ def told_starts(windows: Windows, theta: FloatArray, tuning: GrowingTuning) -> F
     return starts
 
 
+def lent(windows: Windows, view: Windows) -> int:
+    """Let a view of the windows, which simulates a share of them, spend what they have left; the rollouts until now."""
+    before, share = windows.rollouts, float(view.steps.sum() / windows.steps.sum())
+    view.rollouts, view.budget = before, before + (windows.budget - before) / share
+    return before
+
+
 def counted(windows: Windows, view: Windows, before: int) -> None:
     """Count the rollouts of a view of the windows, which simulates a share of them, since there were ``before``."""
     windows.rollouts = before + math.ceil((view.rollouts - before) * (view.steps.sum() / windows.steps.sum()))
@@ -213,23 +220,24 @@ def grown_starts(
     starts, horizon = windows.no_starts(), first or first_horizon(windows, tuning)
     white, flat = Noise(noise.sd, np.zeros_like(noise.tau)), QuadraticPrior(theta, np.zeros((len(theta), len(theta))))
     while True:
-        view, before = windows.beginnings(horizon), windows.rollouts
-        view.rollouts, view.budget = before, windows.budget
-        energy = WindowEnergy(view, white, flat)
-        for _ in range(tuning.start_steps):
-            lin = view.linearise(theta, starts, with_theta=False)
-            if not lin.valid:
-                break
-            moments = view.moments(lin, white=True)
-            linearised = ManyStarts(energy, WindowPoint(theta, starts, lin.residual), moments, tuning.shares)
-            change = marginal(moments, white, starts, view.start_precision)[1]
-            point, after = linearised.simulated(theta, change)
-            gained = linearised.energy - after
-            starts = point.starts if gained > 0 else starts
-            if gained < tuning.enough * linearised.energy:
-                break
-        counted(windows, view, before)
-        if horizon >= windows.steps.max() or not lin.valid:
+        view = windows.beginnings(horizon)
+        before, energy = lent(windows, view), WindowEnergy(view, white, flat)
+        try:
+            for _ in range(tuning.start_steps):
+                lin = view.linearise(theta, starts, with_theta=False)
+                if not lin.valid:
+                    return starts
+                moments = view.moments(lin, white=True)
+                linearised = ManyStarts(energy, WindowPoint(theta, starts, lin.residual), moments, tuning.shares)
+                change = marginal(moments, white, starts, view.start_precision)[1]
+                point, after = linearised.simulated(theta, change)
+                gained = linearised.energy - after
+                starts = point.starts if gained > 0 else starts
+                if gained < tuning.enough * linearised.energy:
+                    break
+        finally:
+            counted(windows, view, before)
+        if horizon >= windows.steps.max():
             return starts
         horizon = math.ceil(tuning.growth * horizon)
 
@@ -274,15 +282,9 @@ def scattered(
 
 
 def scatter_finding(estimates: FloatArray, tuning: GrowingTuning, why: Doubt) -> Finding:
-    """That the normal is that of the scatter of groups' estimates (G, N), and why.
-
-    It blocks where the model follows hardly a window: what misses alike is off alike, and scatters little.
-    """
-    lost, severity = (
-        len(estimates) - len(_reliable(estimates, tuning)),
-        Severity.BLOCKING if why is Doubt.LOST else None,
-    )
-    return finding(Code.SCATTER, severity=severity, groups=len(estimates), lost=lost, why=why)
+    """That the normal is that of the scatter of groups' estimates (G, N), and why."""
+    lost = len(estimates) - len(_reliable(estimates, tuning))
+    return finding(Code.SCATTER, groups=len(estimates), lost=lost, why=why)
 
 
 def _reliable(estimates: FloatArray, tuning: GrowingTuning) -> FloatArray:

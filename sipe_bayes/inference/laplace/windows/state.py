@@ -187,8 +187,8 @@ class WindowOptimum(Optimum):
 
     @property
     def scatters(self) -> bool:
-        """Whether its normal is that of the scatter of groups of windows, not of the likelihood."""
-        return self.finding is not None and self.finding.code is Code.SCATTER
+        """Whether its normal is that of the scatter of groups of windows, or of windows that are not followed."""
+        return self.finding is not None and self.finding.code in (Code.SCATTER, Code.WINDOWS_LOST)
 
     @property
     def judged_sd(self) -> FloatArray:
