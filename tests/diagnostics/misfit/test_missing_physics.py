@@ -100,7 +100,7 @@ def test_through_impacts_the_way_of_the_causes_is_as_unsure_as_it_is_long(monkey
     after = of_logs(recorded, doubted=True)[2]
     assert after[0, 1] < before[0, 1]
     assert after[1, 1] > before[1, 1]
-    assert 2 < (after[1, 1] - after[0, 1]) / (before[1, 1] - before[0, 1]) < 8  # the causes move it by four widths
+    assert 2 < (after[1, 1] - after[0, 1]) / (before[1, 1] - before[0, 1]) < 8
 
 
 def test_of_a_right_model_they_are_not_far_wider_and_hold_the_truth() -> None:
