@@ -27,7 +27,8 @@ Deviations:
   dozen of them together would explain anything.
 - The noise is estimated anew with the columns that were taken, in turns.
 - Through impacts the causes that are taken move theta by normal shares of what they do to first order, with an sd of
-  ``unsure``: there corrections were in the right direction, and half as far as it takes.
+  ``unsure``: there corrections were in the right direction, and half as far as it takes. And they are taken beside
+  noise of the samples' scatter, as what the residuals look like is named (``misfit.misspecification``).
 - Gains that differ between logs are not taken: they would explain why logs differ, which the spread is to hold.
 """
 
@@ -176,7 +177,9 @@ class _Causes:
     def of(cls, logs: ProbedLogs, options: MissingPhysicsOptions) -> _Causes:
         """In turns with the noise."""
         windows, n = logs.windows, logs.windows.num_theta
-        pull, noise, memory = -windows.start_precision * logs.starts, logs.noise, logs.memory
+        pull, impacts = -windows.start_precision * logs.starts, grows(windows)
+        beside = logs.at_scatter if impacts else logs
+        noise, memory = beside.noise, beside.memory
         span = float(windows.dt.min()), windows.trajectories.longest
         usable = np.array([not probe.by_log for probe in logs.probes], bool)
         prior, prior_pull = FLAT_PRECISION * np.eye(logs.count), np.zeros(logs.count)
@@ -201,6 +204,7 @@ class _Causes:
                 logs.moments(columns), noise, pulls, windows.fixed_sd, logs.coloured, *span, windows.scales
             )
             noise = Noise(np.maximum(noise.sd, windows.rounding), noise.tau)
+            noise = logs.beside_scatter(noise) if impacts else noise
             step = covariance @ gradient[columns]
             whole = np.zeros(logs.count)
             whole[columns] = step

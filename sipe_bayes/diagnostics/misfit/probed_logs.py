@@ -194,13 +194,17 @@ class ProbedLogs:
 
         That holds what a wrong model leaves, and hides what it is: slow noise passes for slow forces.
         """
+        noise = self.beside_scatter(self.noise)
+        return self if noise is self.noise else self._with(noise)
+
+    def beside_scatter(self, noise: Noise) -> Noise:
+        """A noise, white and of the samples' scatter in channels where it is far more; itself where none is."""
         scatter = level(self.windows).sd
         rests = scatter < MISFIT.rounding * self.windows.rounding
-        holds = (scatter * MISFIT.hides < self.noise.sd) & ~rests
+        holds = (scatter * MISFIT.hides < noise.sd) & ~rests
         if not holds.any():
-            return self
-        noise = Noise(np.where(holds, scatter, self.noise.sd), np.where(holds, 0.0, self.noise.tau))
-        return self._with(noise)
+            return noise
+        return Noise(np.where(holds, scatter, noise.sd), np.where(holds, 0.0, noise.tau))
 
     def _with(self, noise: Noise) -> ProbedLogs:
         """The same logs beside another noise."""
