@@ -148,7 +148,7 @@ def onward(
     Starts of windows that are not followed are looked for anew there.
     """
     at = look.at
-    step = _step(windows, look, at.held(prior), tuning).point
+    step = _step(windows, look, at.held(prior), tuning, growing).point
     if step is None:
         return None
     moved = at.starts.copy()
@@ -189,12 +189,14 @@ def regrown(
     return starts if np.isfinite(square.min(0)).all() else None
 
 
-def _step(windows: Windows, look: FollowedLook, prior: QuadraticPrior, tuning: FollowedTuning) -> Descent[WindowPoint]:
+def _step(
+    windows: Windows, look: FollowedLook, prior: QuadraticPrior, tuning: FollowedTuning, growing: GrowingTuning
+) -> Descent[WindowPoint]:
     """A step downhill of theta and the starts of what is followed."""
     at, part = look.at, look.windows
     before = lent(windows, part)
     energy, point = WindowEnergy(part, at.noise, prior), WindowPoint(at.theta, at.starts[at.kept], look.lin.residual)
-    linearised = ManyStarts(energy, point, part.moments(look.lin), _GROWING.shares)
+    linearised = ManyStarts(energy, point, part.moments(look.lin), growing.shares)
     descent = descend(linearised, _RULE.first, tuning.settled, _RULE)
     counted(windows, part, before)
     return descent
