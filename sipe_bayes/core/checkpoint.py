@@ -136,6 +136,10 @@ class Kept:
             part.unlink(missing_ok=True)  # another run in this folder may have been faster
         return load_state(path, kind, self.fingerprint)
 
+    def under(self, name: str) -> Kept:
+        """For pieces of work that go by the same names as others."""
+        return Kept(self.folder, self.fingerprint, f"{self.within}{name}.")
+
 
 NOTHING_KEPT = Kept()
 

@@ -11,6 +11,7 @@ import torch
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code
+from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.importance import ImportanceTuning
@@ -132,16 +133,7 @@ class Fitting:
 
     def prior_of(self, simulator: Simulator) -> Posterior:
         """The user's prior beside those of the extensions."""
-        space, n = simulator.space, len(self.prior.space)
-        own = default_prior(space)
-        mine = default_prior(self.prior.space)
-        same = zip(mine.gaussian_moments(), self.prior.gaussian_moments(), strict=True)
-        if len(space) == n or all(torch.equal(a, b) for a, b in same):
-            return own if len(space) > n else self.prior
-        mean, covariance = (x.numpy().copy() for x in own.gaussian_moments())
-        covariance[np.isinf(covariance)] = _FLAT_SD**2
-        mean[:n], covariance[:n, :n] = (x.numpy() for x in self.prior.gaussian_moments())
-        return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space)
+        return beside(self.prior, simulator.space)
 
     def fit(
         self, placed: Sequence[Placed], initial: FloatArray | None, budget: int, progress: Progress | None = None
@@ -255,6 +247,19 @@ class Fitting:
         best = distinct(laplace.state.search.optima)[0]
         assert isinstance(best, WindowOptimum)
         return _Optimum(best, laplace.rollouts)
+
+
+def beside(prior: Posterior, space: ParameterSpace) -> Posterior:
+    """The user's prior of the first parameters of a space, and the others' own."""
+    own, n = default_prior(space), len(prior.space)
+    mine = default_prior(prior.space)
+    same = zip(mine.gaussian_moments(), prior.gaussian_moments(), strict=True)
+    if len(space) == n or all(torch.equal(a, b) for a, b in same):
+        return own if len(space) > n else prior
+    mean, covariance = (x.numpy().copy() for x in own.gaussian_moments())
+    covariance[np.isinf(covariance)] = _FLAT_SD**2
+    mean[:n], covariance[:n, :n] = (x.numpy() for x in prior.gaussian_moments())
+    return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space)
 
 
 def _scoring(windows: Windows) -> int:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -63,6 +63,8 @@ class Probe:
         whole: its size where the number that it changes is off by all that a tolerance is a share of; nan where logs
             alone tell that number.
         trade: (N,) by which it changes theta itself at size 1, and with the root of any other; none where not at all.
+        placed: the extension at that site; None of what has no parameters.
+        step: (P,) by which size 1 changes theta of its parameters, in proportion.
     """
 
     name: str
@@ -72,6 +74,8 @@ class Probe:
     extension: Extension | None = None
     whole: float = math.nan
     trade: tuple[float, ...] = ()
+    placed: Placed | None = field(default=None, compare=False)
+    step: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -168,15 +172,17 @@ def _named(effect: Effect) -> list[Probe]:
     remedy = f"add {' and '.join(targets)} {what}"
     if placed.edit is not None:  # the model has no such part yet
         remedy = f"let `sipe discover` put it in (--only {placed.extension.name})"
-    probe = Probe(placed.sentence, remedy, by_log, placed.site, placed.extension)
+    probe = Probe(placed.sentence, remedy, by_log, placed.site, placed.extension, placed=placed)
+    size, away = _size(effect.change), effect.probes - placed.plain
+    named = [replace(probe, step=tuple(row)) for row in (away / size[:, None]).tolist()]
     if effect.trades.any():
-        sized = effect.trades / np.sqrt(_size(effect.change))[:, None]
-        return [replace(probe, trade=tuple(row)) for row in sized.tolist()]
+        sized = effect.trades / np.sqrt(size)[:, None]
+        return [replace(one, trade=tuple(row)) for one, row in zip(named, sized.tolist(), strict=True)]
     if not placed.wholes:
-        return [probe] * len(effect.probes)
+        return named
     ranges = np.array([parameter.high - parameter.low for parameter in placed.parameters])
-    shares = ((effect.probes - placed.plain) * ranges / np.array(placed.wholes)).sum(-1)
-    return [replace(probe, whole=whole) for whole in (_size(effect.change) / shares).tolist()]
+    wholes = size / (away * ranges / np.array(placed.wholes)).sum(-1)
+    return [replace(one, whole=whole) for one, whole in zip(named, wholes.tolist(), strict=True)]
 
 
 def bounds(plain: FloatArray, tried: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
@@ -12,11 +11,12 @@ from sipe_bayes.calibration.checks.fitted import Fit
 from sipe_bayes.calibration.checks.plan import Check, Checks
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
+from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.core.findings import Code, Finding, Findings, finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.evaluate import fitted_residuals
+from sipe_bayes.diagnostics.misfit.asked_windows import AskedWindows
 from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics, spread_alone
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import MISFIT, ProbedLogs
@@ -27,13 +27,12 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.windows.followed import followed_windows
 from sipe_bayes.inference.laplace.windows.growing_windows import Doubt, grows
-from sipe_bayes.inference.laplace.windows.state import Followed, WindowState
+from sipe_bayes.inference.laplace.windows.state import WindowState
 from sipe_bayes.inference.random_effects import LogEstimate
-from sipe_bayes.inference.recorded import Tell, silent
-from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.inference.recorded import Tell
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.settings import StateSpace
-from sipe_bayes.likelihood.windows import Linearisation, Windows
+from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Particles, Posterior
 
 
@@ -69,47 +68,6 @@ class Lacking:
             return None
         further = Particles(self.missing.theta, space, weights=self.missing.weights)
         return MissingPhysics(further, self.missing.causes, self.missing.explained)
-
-
-@dataclass(frozen=True)
-class AskedWindows:
-    """Windows whose residuals are asked what the model lacks.
-
-    Args:
-        windows: those.
-        theta: (N,) the estimate.
-        starts: (W, D) there.
-        noise: (C,) of these windows.
-        prior: of theta.
-        lin: at theta and starts, where it is known.
-        among: how many windows they were chosen from.
-    """
-
-    windows: Windows
-    theta: FloatArray
-    starts: FloatArray
-    noise: Noise
-    prior: QuadraticPrior
-    lin: Linearisation | None
-    among: int
-
-    @classmethod
-    def at(cls, at: Followed, windows: Windows, prior: QuadraticPrior, lin: Linearisation | None = None) -> Self:
-        """Those of some windows that are followed, at their optimum."""
-        among, starts = windows.num_windows, at.starts[at.kept]
-        return cls(at.of(windows), at.theta, starts, at.noise, at.held(prior), lin, among)
-
-    def probed(self, tell: Tell = silent, kept: Kept = NOTHING_KEPT) -> ProbedLogs:
-        """With what extensions would do to them; of what follows impacts, noise may be larger for a while.
-
-        Args:
-            tell: called with what is being done.
-            kept: keeps what extensions do, and draws of the null.
-        """
-        steady = not grows(self.windows)
-        return ProbedLogs(
-            self.windows, self.theta, self.noise, self.starts, self.prior, self.lin, tell, kept, steady=steady
-        )
 
 
 def lacking(
@@ -217,7 +175,7 @@ def asked_windows(method: Estimator, fit: Fit, believed: Posterior) -> AskedWind
     """
     prior = QuadraticPrior.of(believed)
     if not grows(fit.windows):
-        return AskedWindows(fit.windows, fit.theta, fit.starts, fit.noise, prior, fit.lin, fit.windows.num_windows)
+        return AskedWindows(fit.windows, fit.theta, fit.starts, fit.noise, prior, fit.lin)
     if isinstance(method, Laplace):
         at = method.followed
         return None if at is None else AskedWindows.at(at, fit.windows, prior)

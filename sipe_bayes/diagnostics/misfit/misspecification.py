@@ -119,19 +119,12 @@ class _Named:
         sd = np.sqrt(seen.variance) if self.sd is None else self.sd
         moved = step[:n] - seen.step[:n] + logs.traded(step[n:])
         shift = (np.clip(logs.theta + moved, 0, 1) - self.estimate) / np.maximum(sd, 1e-12)
-        causes = self._alike(probe, seen)
+        causes = _alike(logs, probe)
         cause, remedy = " or ".join(c.name for c in causes), " or ".join(c.remedy for c in causes)
         moves = dict(zip(names, shift.tolist(), strict=True))
         searchable = not grows(logs.windows)
         named = self._placed(p, cause, remedy + "; or run sipe discover" * searchable, gains, share, moves)
         return replace(named, alike=len(causes), searchable=searchable)
-
-    def _alike(self, probe: int, seen: Solved) -> list[Probe]:
-        """The best probe and those of other causes that explain about as much, best first."""
-        square = seen.score**2 / seen.information
-        close = [k for k in np.argsort(-square) if square[k] >= MISFIT.alike * square[probe]]
-        named = {self.logs.probes[k].name: self.logs.probes[k] for k in [probe, *close]}
-        return list(named.values())[: MISFIT.causes]
 
     def _colour_named(self, p: float, statistic: int, seen: Solved) -> Misfit:
         """statistic: of 2 C, autocorrelations first."""
@@ -172,6 +165,20 @@ class _Named:
         if held:
             remedy = f"widen the bounds of {', '.join(held)} first, which the log presses against, or {remedy}"
         return Misfit(p, cause, remedy, name, windows.fitted[channel], *span, shares, shift)
+
+
+def alike(logs: ProbedLogs) -> list[str]:
+    """Names of the probe that explains most and of other causes that explain about as much, best first."""
+    square = logs.seen.score**2 / logs.seen.information
+    return [probe.name for probe in _alike(logs, int(square.argmax()))] if len(square) else []
+
+
+def _alike(logs: ProbedLogs, probe: int) -> list[Probe]:
+    """A probe and those of other causes that explain about as much, best first."""
+    square = logs.seen.score**2 / logs.seen.information
+    close = [k for k in np.argsort(-square) if square[k] >= MISFIT.alike * square[probe]]
+    named = {logs.probes[k].name: logs.probes[k] for k in [probe, *close]}
+    return list(named.values())[: MISFIT.causes]
 
 
 def _foretold(z: FloatArray) -> FloatArray:

@@ -10,8 +10,9 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.agreement import parts_of
-from sipe_bayes.diagnostics.misfit import missing_physics as missing
-from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics, sparse
+from sipe_bayes.diagnostics.misfit import causes
+from sipe_bayes.diagnostics.misfit.causes import sparse
+from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.likelihood.binding import bind
@@ -96,7 +97,7 @@ def test_through_impacts_the_way_of_the_causes_is_as_unsure_as_it_is_long(monkey
     """Of the damping, which dry friction moves; half of the draws are those of the whole library, as before."""
     recorded = [log(pendulum(FRICTION), [0.6, 0.08, 0.04], seed, name=f"log {seed}") for seed in range(2, 5)]
     before = of_logs(recorded, doubted=True)[2]
-    monkeypatch.setattr(missing, "grows", lambda windows: True)
+    monkeypatch.setattr(causes, "grows", lambda windows: True)
     after = of_logs(recorded, doubted=True)[2]
     assert after[0, 1] < before[0, 1]
     assert after[1, 1] > before[1, 1]

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from sipe_bayes.calibration.checks.lacking import AskedWindows, asked_windows
+from sipe_bayes.calibration.checks.lacking import asked_windows
 from sipe_bayes.core.findings import Code, finding
+from sipe_bayes.diagnostics.misfit.asked_windows import AskedWindows
 from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.inference.laplace.estimator import Laplace

@@ -1,0 +1,270 @@
+"""Causes put into the model: windows through impacts fitted again with the physics that their residuals ask for.
+
+To first order missing physics moves theta the right way, and through impacts about half as far as it takes
+(``misfit.causes``): what it does to a joint decides when that strikes, and from there on nothing is linear. So the few
+pieces that the evidence keeps become parameters of the model, and the windows that the larger model follows, with
+their optimum, are looked for from where the linear model points (``laplace.windows.followed``). Of pieces that stood in
+for each other the simulation then tells which it is: the others' sizes end at nothing. What is left is asked again, and
+what it looks like put in beside, ``rounds`` times at most.
+
+Where the larger model follows most windows, groups of them agree, and its residuals pass for noise, theta is that of
+the larger model, widened as of any model that seems right (``misfit.library_discrepancy``). Else nothing is said here,
+and what is known to first order stands (``misfit.missing_physics``). Nor is it where no cause is seen by ``seen`` sds: what
+is that small looks like several things, whose sizes no simulation tells.
+
+This is a step of forward selection (N. Draper, H. Smith, "Applied Regression Analysis", 1966, chapter 6), several at
+once, for the score tests of ``misfit.misspecification``. It does not compare rivals by their evidence, as ``sipe
+discover`` does where motion is smooth: of two pieces that these logs do not tell apart, one may stand for both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
+from sipe_bayes.core.options import Options, option
+from sipe_bayes.diagnostics.misfit.asked_windows import AskedWindows
+from sipe_bayes.diagnostics.misfit.causes import Causes
+from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
+from sipe_bayes.diagnostics.misfit.misspecification import alike, misfit
+from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
+from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances
+from sipe_bayes.diagnostics.put_in import PutIn
+from sipe_bayes.envs.mjcf import MjcfEnvironment
+from sipe_bayes.inference.laplace.options import GrowingTuning, WindowTuning
+from sipe_bayes.inference.laplace.windows.followed import FOLLOWED, agreement, followed_windows
+from sipe_bayes.inference.laplace.windows.growing_windows import Doubt
+from sipe_bayes.inference.laplace.windows.state import Followed
+from sipe_bayes.inference.recorded import Tell, silent
+from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.posterior import GaussianMixture, Particles, Posterior
+from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.structure.extension import Placed, extended
+from sipe_bayes.structure.fitted import beside
+from sipe_bayes.structure.internal_starts import mapped_starts
+
+_INSIDE = 1e-3  # of the cube, from its faces: where parameters of extensions begin
+
+
+@dataclass(frozen=True)
+class LargerModelOptions(Options):
+    """When causes are put in, and count as there."""
+
+    rounds: int = option(2, "in which what is left is put in, too", least=1)
+    seen: float = option(10.0, "from none, to first order: a smaller cause is not put in", "sds", above=0)
+    told: float = option(3.0, "from none, from which a cause that was put in is there", "sds", above=0)
+    steps: int = option(12, "towards the optimum of the windows that are followed: there are more unknowns", least=1)
+
+
+_OPTIONS = LargerModelOptions()
+
+
+@dataclass(frozen=True)
+class LargerModel:
+    """Theta of a model with causes in it that leaves nothing but noise.
+
+    Args:
+        further: theta of the plain model's N parameters.
+        causes: that are there, with their sizes, the surest first.
+        followed: windows that it follows.
+        p: of residuals as odd as those that it leaves.
+    """
+
+    further: Particles
+    causes: tuple[PutIn, ...]
+    followed: int
+    p: float
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """Where a larger model follows windows, and the chance that groups of them ask for as different values."""
+
+    at: Followed
+    agreement: float
+
+
+@dataclass(frozen=True)
+class _Larger:
+    """A model with causes in it.
+
+    Args:
+        placed: those.
+        asked: the windows that it follows.
+        prior: of the N + P parameters.
+        agreement: chance that groups of the windows ask for as different values.
+    """
+
+    placed: tuple[Placed, ...]
+    asked: AskedWindows
+    prior: Posterior
+    agreement: float
+
+
+def larger_model(
+    asked: AskedWindows,
+    probed: ProbedLogs,
+    prior: Posterior,
+    seed: int = 0,
+    tolerances: Tolerances = EXACT,
+    tell: Tell = silent,
+    kept: Kept = NOTHING_KEPT,
+    options: LargerModelOptions = _OPTIONS,
+) -> LargerModel | None:
+    """Put causes in; each round costs what choosing the followed windows and probing them does.
+
+    Args:
+        asked: windows through impacts, of a model that lacks something.
+        probed: they, linearised.
+        prior: of theta (N,).
+        seed: of the draws.
+        tolerances: of numbers that no machine has exactly.
+        tell: called with what is being done.
+        kept: keeps what each round ended with.
+        options: of the search.
+
+    Returns:
+        None where no larger model leaves nothing but noise, or the windows do not go through impacts.
+    """
+    first = probed.at_scatter.seen
+    if not (first.score**2 >= options.seen**2 * first.information).any():
+        return None
+    larger, logs = _Larger((), asked, prior, 1.0), probed
+    for number in range(options.rounds):
+        within = kept.under(f"larger-{number}")
+        tell(f"putting in what the residuals look like, round {number + 1} of at most {options.rounds}")
+        try:
+            grown = _grown(larger, logs, prior, within, options.steps)
+        except np.linalg.LinAlgError:
+            return None
+        if grown is None:
+            return None
+        larger, logs = grown, grown.asked.probed(tell, within)
+        own = _normal(logs, larger.prior)
+        seen = misfit(logs, own.stddev.numpy(), seed, estimate=logs.theta)
+        if not seen.alarm:
+            break
+    else:
+        return None
+    if not _stands(larger, logs):
+        return None
+    causes = tuple(_there(larger, logs, options))
+    if not causes:
+        return None
+    missing = missing_physics(logs, own, larger.prior, False, seed, tolerances)
+    n, further = len(prior.space), _draws(own, seed) if missing is None else missing.further
+    there = Particles(further.theta.numpy()[:, :n], prior.space, weights=further.weights.numpy())
+    return LargerModel(there, causes, logs.windows.num_windows, seen.p)
+
+
+def _grown(larger: _Larger, logs: ProbedLogs, prior: Posterior, kept: Kept, steps: int) -> _Larger | None:
+    """With what the evidence keeps put in beside; None where that is nothing, or too few windows are followed then."""
+    environment = logs.windows.simulator.environment
+    if larger.asked.chosen is None or not isinstance(environment, MjcfEnvironment):
+        return None
+    causes = Causes.of(logs)
+    placed, theta = _placed(logs, causes, environment)
+    if not placed:
+        return None
+    every, before = larger.asked.chosen
+    simulator = Simulator(extended(environment, placed), logs.windows.simulator.num_threads)
+    windows = Windows(every.settings, simulator, every.trajectories, every)
+    windows.budget = every.budget - every.rollouts
+    believed = beside(prior, simulator.space)
+    quadratic = QuadraticPrior.of(believed)
+
+    def made(kept: Kept) -> tuple[_Fitted, ...]:
+        starts = mapped_starts(every.simulator.model, simulator.model, before.starts)
+        noise, tuning = logs.beside_scatter(before.noise), replace(FOLLOWED, rounds=1 + steps)
+        look = followed_windows(windows, theta, starts, noise, quadratic, tuning)
+        return () if isinstance(look, Doubt) else (_Fitted(look.at, agreement(look, GrowingTuning().groups)),)
+
+    fitted = next(iter(kept.of("fitted", tuple[_Fitted, ...], made)), None)
+    every.rollouts += windows.rollouts
+    if fitted is None:
+        return None
+    asked = AskedWindows.at(fitted.at, windows, quadratic)
+    return _Larger((*larger.placed, *placed), asked, believed, fitted.agreement)
+
+
+def _placed(logs: ProbedLogs, causes: Causes, environment: MjcfEnvironment) -> tuple[list[Placed], FloatArray]:
+    """Extensions of causes that a model can have together, and theta (N + P,) with them.
+
+    The surest first, then those that explain about as much as the best by themselves.
+    """
+    n, sizes = logs.windows.num_theta, causes.sizes(logs)
+    sure = np.abs(causes.step[n:]) / np.sqrt(np.diag(causes.covariance))
+    placed: list[Placed] = []
+    away: dict[str, FloatArray] = {}
+    rivals = (k for k, probe in enumerate(logs.probes) if probe.name in alike(logs.at_scatter))
+    for k in dict.fromkeys([*causes.kept[np.argsort(-sure)].tolist(), *rivals]):
+        probe = logs.probes[k]
+        if probe.placed is None:
+            continue
+        if probe.placed.label not in away:
+            if not _can_have(environment, [*placed, probe.placed]):
+                continue
+            placed.append(probe.placed)
+            away[probe.placed.label] = np.zeros(len(probe.step))
+        away[probe.placed.label] += sizes[k] * np.array(probe.step)
+    theta = np.clip(logs.theta + causes.step[:n] + logs.traded(sizes), 0, 1)
+    own = [np.clip(one.plain + away[one.label], _INSIDE, 1 - _INSIDE) for one in placed]
+    return placed, np.concatenate([theta, *own])
+
+
+def _can_have(environment: MjcfEnvironment, placed: Sequence[Placed]) -> bool:
+    """Whether no two of them write the same number."""
+    try:
+        extended(environment, placed)
+    except ValueError:
+        return False
+    return True
+
+
+def _normal(logs: ProbedLogs, prior: Posterior) -> GaussianMixture:
+    """Of theta (N + P,) where the logs are linearised."""
+    n = logs.windows.num_theta
+    precision = logs.arrow.precision[:n, :n] + logs.inner
+    mean = logs.theta + np.linalg.solve(precision, logs.arrow.gradient[:n] + logs.pull)
+    return GaussianMixture(torch.zeros(1), mean[None], np.linalg.inv(precision)[None], prior.space)
+
+
+def _draws(own: GaussianMixture, seed: int) -> Particles:
+    return Particles(own.sample((4000,), generator=torch.Generator().manual_seed(seed)), own.space)
+
+
+def _stands(larger: _Larger, logs: ProbedLogs) -> bool:
+    """Whether the larger model is followed in most windows, at their optimum, and groups of them agree."""
+    n, left = logs.windows.num_theta, _normal(logs, larger.prior).mode.numpy() - logs.theta
+    precision = logs.arrow.precision[:n, :n] + logs.inner
+    settled = 0.5 * float(left @ precision @ left) <= WindowTuning().most_drift
+    most = larger.asked.windows.num_windows >= FOLLOWED.most * larger.asked.among
+    return settled and most and larger.agreement >= FOLLOWED.apart
+
+
+def _there(larger: _Larger, logs: ProbedLogs, options: LargerModelOptions) -> list[PutIn]:
+    """Causes whose parameters are told from the plain model's, by the one that is told best, the surest first."""
+    n = logs.windows.num_theta - sum(len(one.parameters) for one in larger.placed)
+    sd = _normal(logs, larger.prior).stddev.numpy()
+    out: list[tuple[float, PutIn]] = []
+    for one in larger.placed:
+        own = np.arange(n, n + len(one.parameters))
+        n += len(one.parameters)
+        sizes = [parameter.default is not None for parameter in one.parameters]  # of others the plain model has none
+        away = np.where(sizes, np.abs(logs.theta[own] - one.plain) / sd[own], 0.0)
+        k = int(away.argmax())
+        if away[k] < options.told:
+            continue
+        parameter, theta = one.parameters[k], float(logs.theta[own[k]])
+        value, low, high = (float(parameter.value(x)) for x in (theta, theta - sd[own[k]], theta + sd[own[k]]))
+        targets = tuple(target for p in one.parameters for target in p.targets)
+        out.append(
+            (float(away[k]), PutIn(one.sentence, parameter.name, value, (high - low) / 2, parameter.unit, targets))
+        )
+    return [cause for _, cause in sorted(out, key=lambda pair: -pair[0])]
