@@ -15,7 +15,8 @@ That was made with seven of these machines, ``MADE_WITH``. Nothing was changed f
 (how many samples may lie far off in a window that is followed) by right models of all, seeds 1 and 2.
 
 Coverage is that of 90 %
-intervals, pooled over parameters, as ``wrong_models.py`` has them; ``not blocked`` are the fits that no finding blocks.
+intervals, pooled over parameters, as ``wrong_models.py`` has them; ``not blocked`` are the fits that no finding blocks,
+``put in`` those whose model got what it lacked (``diagnostics.misfit.larger_model``).
 Every fit is one line in runs/wrong_contact.jsonl, results/wrong_contact.json holds the tables.
 """
 
@@ -41,6 +42,7 @@ from sipe_bayes.calibration.checks.lacking import asked_windows, groups_apart
 from sipe_bayes.core.files import write_text
 from sipe_bayes.core.findings import Severity
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.diagnostics.misfit.larger_model import larger_model
 from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics, spread_alone
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.inference.laplace.estimator import Laplace
@@ -119,17 +121,19 @@ def fitted(name: str, effect: str, seed: int) -> Iterator[dict[str, Any]]:
     assert starts is not None
     asked = asked_windows(method, Fit(windows, theta, noise, starts, False), method.prior)
     for unknown in (False, True)[: 1 if effect == "null" else 2]:
-        began, seen, missing = time.process_time(), None, None
+        began, seen, missing, larger = time.process_time(), None, None, None
         library = [e for e in EXTENSIONS if not (unknown and e == effect)]
         if asked is not None:
             with mock.patch(  # not by name: the physics step is asked of, too
                 "sipe_bayes.structure.probes.EXTENSIONS", library
             ):
                 probed = asked.probed()
-            seen = misfit(probed, posterior.stddev.numpy(), seed, estimate=theta)
+                seen = misfit(probed, posterior.stddev.numpy(), seed, estimate=theta)
+                larger = larger_model(asked, probed, seen, posterior, method.prior, seed)
             missing = missing_physics(probed, posterior, method.prior, seen.alarm, seed)
         elif groups := groups_apart(method, posterior):
             missing = spread_alone(groups, method.prior, True, seed)
+        further = larger or missing
         yield {
             "machine": name,
             "effect": effect,
@@ -138,12 +142,13 @@ def fitted(name: str, effect: str, seed: int) -> Iterator[dict[str, Any]]:
             "windows": windows.num_windows,
             "asked": 0 if asked is None else asked.windows.num_windows,
             "alarm": seen is not None and seen.alarm,
-            "cause": None if seen is None else seen.cause,
+            "cause": None if seen is None else (larger.looks if larger is not None else seen).cause,
+            "put_in": [] if larger is None else [[c.parameter, c.value, c.sd] for c in larger.causes],
             "blocking": sorted(str(f.code) for f in method.findings if f.severity is Severity.BLOCKING),
             "truth": truth.tolist(),
             "ends": {
                 "plain": ends(posterior),
-                "lacking": ends(posterior if missing is None else missing.further),
+                "lacking": ends(posterior if further is None else further.further),
             },
             "causes": [] if missing is None else list(missing.causes),
             "fit_s": round(fit_s, 1),
@@ -163,8 +168,10 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, Any]:
             "right models": [r for r in mine if r["effect"] == "null"],
             "right models, not blocked": [r for r in mine if r["effect"] == "null" and not r["blocking"]],
             "in the library": [r for r in wrong if not r["unknown"]],
+            "in the library, put in": [r for r in wrong if not r["unknown"] and r["put_in"]],
             "in the library, not blocked": [r for r in wrong if not r["unknown"] and not r["blocking"]],
             "unknown": [r for r in wrong if r["unknown"]],
+            "unknown, put in": [r for r in wrong if r["unknown"] and r["put_in"]],
             "unknown, not blocked": [r for r in wrong if r["unknown"] and not r["blocking"]],
             "wrong, without an alarm, not blocked": [r for r in wrong if not r["alarm"] and not r["blocking"]],
         }

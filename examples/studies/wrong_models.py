@@ -157,8 +157,10 @@ def ends(posterior: Posterior) -> list[list[float]]:
 
 
 def printed(row: dict[str, Any]) -> FloatArray:
-    """What the report shows first, the plain intervals within: (2, N)."""
+    """What the report shows first (2, N): the plain intervals within, but where what was missing was put in."""
     plain_ends, lacking = np.array(row["ends"]["plain"]), np.array(row["ends"]["lacking"])
+    if row.get("put_in"):
+        return lacking
     return np.stack([np.minimum(plain_ends[0], lacking[0]), np.maximum(plain_ends[1], lacking[1])])
 
 

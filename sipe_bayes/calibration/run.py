@@ -83,7 +83,8 @@ def calibrate(
     misfit, missing = lacks.misfit, lacks.physics(space)
     doubted = conflict is not None or (misfit is not None and misfit.alarm)
     marginals = Marginals.of(posterior, problem.prior, method.seed, bounded_by_nature(problem.simulator.model, space))
-    summaries = marginals.summaries(None if missing is None else missing.further)
+    further = lacks.further(space)
+    summaries = marginals.summaries(further, apart=bool(lacks.put_in))
     predictions = Predictions.of(problem, theta, checks)
     outside = place_in_prior(problem, method, fit, predictions, checks)
     bands = predictions.bands(posterior, missing if doubted else None, method.seed, checks)
@@ -112,7 +113,8 @@ def calibrate(
         prior=problem.prior,
         parameters=summaries,
         causes=() if missing is None else missing.causes,
-        further=None if missing is None else missing.further,
+        further=further,
+        put_in=lacks.put_in,
         train=predictions.train,
         holdout=predictions.holdout,
         findings=noticed,

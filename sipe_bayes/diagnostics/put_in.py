@@ -15,7 +15,7 @@ class PutIn:
         value: of it, in its unit.
         sd: of the value.
         unit: SI.
-        targets: what its parameters write.
+        remedy: how the model gets it.
     """
 
     cause: str
@@ -23,4 +23,4 @@ class PutIn:
     value: float
     sd: float
     unit: str
-    targets: tuple[str, ...]
+    remedy: str

@@ -9,6 +9,7 @@ from sipe_bayes.core import view
 from sipe_bayes.core.findings import Code, Finding, Findings
 from sipe_bayes.core.html import Page, html_table
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
+from sipe_bayes.diagnostics.put_in import PutIn
 from sipe_bayes.diagnostics.records import (
     BandCoverage,
     ChannelNoise,
@@ -103,6 +104,7 @@ class Calibration:
         causes: for which the parameters' ``further`` allow, to first order.
         further: theta with what the model lacks or may lack, of which the parameters' ``further`` are the intervals;
             None where nothing can be said.
+        put_in: what was put into the model, of which ``further`` then is; none where nothing was, or not all was found.
         mixing: of Markov chains; None of other methods.
         logs: what was read and what was done to it.
         run: configuration, versions, seed and checksums, as JSON has them.
@@ -129,6 +131,7 @@ class Calibration:
     noise: dict[str, ChannelNoise] = field(default_factory=dict)
     causes: tuple[str, ...] = ()
     further: Particles | None = None
+    put_in: tuple[PutIn, ...] = ()
     mixing: Mixing | None = None
     logs: list[LogReport] = field(default_factory=list)
     run: dict[str, object] = field(default_factory=dict)
@@ -197,6 +200,7 @@ class Calibration:
             "bands": None if self.bands is None else asdict(self.bands),
             "misfit": None if self.misfit is None else {**asdict(self.misfit), "matters": self.misfit.matters},
             "causes": list(self.causes),
+            "put_in": [asdict(cause) for cause in self.put_in],
             "outside_prior": [asdict(o) for o in self.outside],
             "ridges": [{"text": r.text, **asdict(r)} for r in self.ridges],
             "findings": [item.to_dict() for item in self.findings],

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from sipe_bayes.core.finding_texts import TEXTS
 from sipe_bayes.core.findings import Code, Findings
 from sipe_bayes.core.thresholds import THRESHOLDS
+from sipe_bayes.diagnostics.put_in import PutIn
 from sipe_bayes.diagnostics.records import BandCoverage, ChannelScore, Comparison
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
-from sipe_bayes.report.words import listed, number, significant
+from sipe_bayes.report.words import listed, number, significant, unit_text
 
 _ONE = "The one value may be trusted within its interval"
 _UNTOLD = "if the numbers that no log tells are right"
@@ -273,6 +274,10 @@ def lack(calibration: Calibration) -> Verdict | None:
     if not misfit.matters:
         return Verdict("fair", f"The model lacks something small: it looks like {misfit.cause} ({share}).")
     text = f"The model lacks something: it looks like {misfit.cause} ({share}, {misfit.p_text})."
+    if calibration.put_in:
+        sizes = listed([_size(cause) for cause in calibration.put_in[:_DOUBTS]])
+        put = f"{text} Put into the model ({sizes}) it leaves nothing but noise: the first intervals are of that model."
+        return Verdict("fair", put)
     text += " `sipe discover` tries it." if misfit.shift and misfit.searchable else ""
     if misfit.alike > 1:  # with which of them values would move is open
         return Verdict("bad", text)
@@ -286,6 +291,12 @@ def lack(calibration: Calibration) -> Verdict | None:
         values = [_would_be(calibration, name, misfit.shift[name]) for name in moved]
         text += f" With it, to first order, {listed(values)}."
     return Verdict("bad", text)
+
+
+def _size(cause: PutIn) -> str:
+    """Of what was put in."""
+    value = significant(cause.value, cause.sd)
+    return f"{cause.parameter} {value} ± {number(cause.sd, 1)} {unit_text(cause.unit)}".rstrip()
 
 
 def _led_out(calibration: Calibration, name: str, sds: float) -> bool:
@@ -336,8 +347,8 @@ def verdicts(calibration: Calibration, brief: bool = False) -> list[Verdict]:
 
 
 def between_logs(calibration: Calibration) -> Verdict | None:
-    """What the intervals with what the model lacks, or may lack, hold, where there are any."""
-    if all(p.further is None for p in calibration.parameters):
+    """What the intervals with what the model lacks, or may lack, hold, where there are any; not of another model."""
+    if all(p.further is None for p in calibration.parameters) or calibration.put_in:
         return None
     if not _lacks(Findings(calibration.findings)):
         return _allowed_for(calibration)

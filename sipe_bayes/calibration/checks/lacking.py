@@ -17,10 +17,12 @@ from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.evaluate import fitted_residuals
 from sipe_bayes.diagnostics.misfit.asked_windows import AskedWindows
+from sipe_bayes.diagnostics.misfit.larger_model import LargerModel, larger_model
 from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics, spread_alone
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import MISFIT, ProbedLogs
 from sipe_bayes.diagnostics.misfit.tolerances import tolerance_findings, untold
+from sipe_bayes.diagnostics.put_in import PutIn
 from sipe_bayes.diagnostics.records import Misfit, Residual
 from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.inference.base import Estimator
@@ -47,23 +49,44 @@ class _Missing:
 
 
 @dataclass(frozen=True)
+class _Larger:
+    """Draws (M, N) of a ``LargerModel``'s theta with their weights (M,), and the causes in it."""
+
+    theta: FloatArray
+    weights: FloatArray
+    causes: tuple[PutIn, ...]
+
+
+@dataclass(frozen=True)
 class Lacking:
     """What the residuals say.
 
     Args:
         misfit: what they look like; None where that was not asked, or cannot be told.
-        missing: theta with what the model lacks, or may lack.
+        missing: theta with what the model lacks, or may lack, to first order.
+        larger: theta with what it lacks put into it; None where that was not asked, or leaves more than noise.
         residuals: of each log and channel; none with a ``StateSpace``, whose process noise takes what the model lacks.
         findings: of what they cannot tell, and of numbers that no motion tells.
     """
 
     misfit: Misfit | None
     missing: _Missing | None
+    larger: _Larger | None
     residuals: tuple[Residual, ...]
     findings: tuple[Finding, ...]
 
+    def further(self, space: ParameterSpace) -> Particles | None:
+        """Theta with what the model lacks, or may lack."""
+        given = self.larger or self.missing
+        return None if given is None else Particles(given.theta, space, weights=given.weights)
+
+    @property
+    def put_in(self) -> tuple[PutIn, ...]:
+        """What was put into the model."""
+        return () if self.larger is None else self.larger.causes
+
     def physics(self, space: ParameterSpace) -> MissingPhysics | None:
-        """What the model lacks, or may lack."""
+        """What the model lacks, or may lack, to first order."""
         if self.missing is None:
             return None
         further = Particles(self.missing.theta, space, weights=self.missing.weights)
@@ -93,10 +116,14 @@ def lacking(
 
     def made(tell: Tell, kept: Kept) -> Lacking:
         unknown: list[Finding] = []
-        probed = _probed(problem, method, fit, unknown, tell, kept)
+        seen = _probed(problem, method, fit, unknown, tell, kept)
+        probed = None if seen is None else seen[1]
         chain = isinstance(problem.likelihood, StateSpace)
         residuals = [] if chain else fitted_residuals(fit.windows, fit.theta, fit.noise, fit.starts)
         looks = None if probed is None else misfit(probed, posterior.stddev.numpy(), method.seed, estimate=fit.theta)
+        larger = None
+        if seen is not None and looks is not None:
+            larger = larger_model(*seen, looks, posterior, problem.prior, method.seed, problem.tolerances, tell, kept)
         tell("intervals with it")
         given = problem.prior, conflict or (looks is not None and looks.alarm), method.seed
         if probed is None:
@@ -104,7 +131,12 @@ def lacking(
             missing = spread_alone(groups, problem.prior, True, method.seed) if groups else spread_alone(alone, *given)
         else:
             missing = missing_physics(probed, posterior, *given, problem.tolerances)
-        return Lacking(looks, None if missing is None else _plain(missing), tuple(residuals), tuple(unknown))
+        kept_missing, kept_larger = (
+            None if missing is None else _plain(missing),
+            None if larger is None else _put(larger),
+        )
+        looks = looks if larger is None else larger.looks
+        return Lacking(looks, kept_missing, kept_larger, tuple(residuals), tuple(unknown))
 
     return checks.of(Check.LACKING, Lacking, made)
 
@@ -114,9 +146,13 @@ def _plain(missing: MissingPhysics) -> _Missing:
     return _Missing(further.theta.numpy(), further.weights.numpy(), missing.causes, missing.explained)
 
 
+def _put(larger: LargerModel) -> _Larger:
+    return _Larger(larger.further.theta.numpy(), larger.further.weights.numpy(), larger.causes)
+
+
 def _probed(
     problem: Problem, method: Estimator, fit: Fit, unknown: list[Finding], tell: Tell, kept: Kept
-) -> ProbedLogs | None:
+) -> tuple[AskedWindows, ProbedLogs] | None:
     """The logs as the checks of their residuals see them; unknown: gets findings of what they cannot tell."""
     if isinstance(problem.likelihood, StateSpace):
         return None
@@ -135,7 +171,7 @@ def _probed(
     except ValueError as error:  # LinAlgError is one
         unknown.append(finding(Code.MISFIT_UNKNOWN, reason=error))
         return None
-    return probed
+    return asked, probed
 
 
 def _left_out(every: Windows, asked: AskedWindows, probed: Windows) -> Iterator[Finding]:

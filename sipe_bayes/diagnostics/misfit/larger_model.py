@@ -7,10 +7,10 @@ their optimum, are looked for from where the linear model points (``laplace.wind
 for each other the simulation then tells which it is: the others' sizes end at nothing. What is left is asked again, and
 what it looks like put in beside, ``rounds`` times at most.
 
-Where the larger model follows most windows, groups of them agree, and its residuals pass for noise, theta is that of
+Where the larger model follows most windows, and as many as the plain one, groups of them agree, and its residuals pass for noise, theta is that of
 the larger model, widened as of any model that seems right (``misfit.library_discrepancy``). Else nothing is said here,
-and what is known to first order stands (``misfit.missing_physics``). Nor is it where no cause is seen by ``seen`` sds: what
-is that small looks like several things, whose sizes no simulation tells.
+and what is known to first order stands (``misfit.missing_physics``). Nor is it where no cause is seen by ``seen`` sds:
+what is that small looks like several things, whose sizes no simulation tells.
 
 This is a step of forward selection (N. Draper, H. Smith, "Applied Regression Analysis", 1966, chapter 6), several at
 once, for the score tests of ``misfit.misspecification``. It does not compare rivals by their evidence, as ``sipe
@@ -35,6 +35,7 @@ from sipe_bayes.diagnostics.misfit.misspecification import alike, misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances
 from sipe_bayes.diagnostics.put_in import PutIn
+from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.options import GrowingTuning, WindowTuning
 from sipe_bayes.inference.laplace.windows.followed import FOLLOWED, agreement, followed_windows
@@ -48,6 +49,7 @@ from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import Placed, extended
 from sipe_bayes.structure.fitted import beside
 from sipe_bayes.structure.internal_starts import mapped_starts
+from sipe_bayes.structure.probes import Probe
 
 _INSIDE = 1e-3  # of the cube, from its faces: where parameters of extensions begin
 
@@ -59,6 +61,7 @@ class LargerModelOptions(Options):
     rounds: int = option(2, "in which what is left is put in, too", least=1)
     seen: float = option(10.0, "from none, to first order: a smaller cause is not put in", "sds", above=0)
     told: float = option(3.0, "from none, from which a cause that was put in is there", "sds", above=0)
+    agree: float = option(0.05, "chance that groups of windows ask for as different values, at least", above=0)
     steps: int = option(12, "towards the optimum of the windows that are followed: there are more unknowns", least=1)
 
 
@@ -72,14 +75,12 @@ class LargerModel:
     Args:
         further: theta of the plain model's N parameters.
         causes: that are there, with their sizes, the surest first.
-        followed: windows that it follows.
-        p: of residuals as odd as those that it leaves.
+        looks: what the plain model's residuals look like: these causes, and where theta is with them.
     """
 
     further: Particles
     causes: tuple[PutIn, ...]
-    followed: int
-    p: float
+    looks: Misfit
 
 
 @dataclass(frozen=True)
@@ -95,13 +96,13 @@ class _Larger:
     """A model with causes in it.
 
     Args:
-        placed: those.
+        probes: those, by what they are seen.
         asked: the windows that it follows.
         prior: of the N + P parameters.
         agreement: chance that groups of the windows ask for as different values.
     """
 
-    placed: tuple[Placed, ...]
+    probes: tuple[Probe, ...]
     asked: AskedWindows
     prior: Posterior
     agreement: float
@@ -110,6 +111,8 @@ class _Larger:
 def larger_model(
     asked: AskedWindows,
     probed: ProbedLogs,
+    looks: Misfit,
+    posterior: Posterior,
     prior: Posterior,
     seed: int = 0,
     tolerances: Tolerances = EXACT,
@@ -120,8 +123,10 @@ def larger_model(
     """Put causes in; each round costs what choosing the followed windows and probing them does.
 
     Args:
-        asked: windows through impacts, of a model that lacks something.
+        asked: windows through impacts.
         probed: they, linearised.
+        looks: what their residuals look like.
+        posterior: of theta (N,), as fitted.
         prior: of theta (N,).
         seed: of the draws.
         tolerances: of numbers that no machine has exactly.
@@ -130,10 +135,10 @@ def larger_model(
         options: of the search.
 
     Returns:
-        None where no larger model leaves nothing but noise, or the windows do not go through impacts.
+        None where nothing is missing, no larger model leaves nothing but noise, or windows do not go through impacts.
     """
     first = probed.at_scatter.seen
-    if not (first.score**2 >= options.seen**2 * first.information).any():
+    if not looks.alarm or not (first.score**2 >= options.seen**2 * first.information).any():
         return None
     larger, logs = _Larger((), asked, prior, 1.0), probed
     for number in range(options.rounds):
@@ -152,7 +157,7 @@ def larger_model(
             break
     else:
         return None
-    if not _stands(larger, logs):
+    if not _stands(larger, logs, asked.windows.num_windows, options):
         return None
     causes = tuple(_there(larger, logs, options))
     if not causes:
@@ -160,7 +165,20 @@ def larger_model(
     missing = missing_physics(logs, own, larger.prior, False, seed, tolerances)
     n, further = len(prior.space), _draws(own, seed) if missing is None else missing.further
     there = Particles(further.theta.numpy()[:, :n], prior.space, weights=further.weights.numpy())
-    return LargerModel(there, causes, logs.windows.num_windows, seen.p)
+    return LargerModel(there, causes, _looks(looks, posterior, probed, logs, causes))
+
+
+def _looks(
+    looks: Misfit, posterior: Posterior, before: ProbedLogs, after: ProbedLogs, causes: Sequence[PutIn]
+) -> Misfit:
+    """What the residuals look like, by name of the causes that were put in."""
+    left = (after.noise.sd / before.noise.sd) ** 2
+    share = dict(zip(before.windows.fitted, np.clip(1 - left, 0, 1).tolist(), strict=True))
+    names, n = posterior.space.names, len(posterior.space)
+    moved = (after.theta[:n] - posterior.mode.numpy()) / np.maximum(posterior.stddev.numpy(), 1e-12)
+    cause, remedy = " and ".join(c.cause for c in causes), " and ".join(c.remedy for c in causes)
+    shift = dict(zip(names, moved.tolist(), strict=True))
+    return replace(looks, cause=cause, remedy=remedy, share=share, shift=shift, alike=1, searchable=False)
 
 
 def _grown(larger: _Larger, logs: ProbedLogs, prior: Posterior, kept: Kept, steps: int) -> _Larger | None:
@@ -169,11 +187,11 @@ def _grown(larger: _Larger, logs: ProbedLogs, prior: Posterior, kept: Kept, step
     if larger.asked.chosen is None or not isinstance(environment, MjcfEnvironment):
         return None
     causes = Causes.of(logs)
-    placed, theta = _placed(logs, causes, environment)
-    if not placed:
+    put, theta = _placed(logs, causes, environment)
+    if not put:
         return None
     every, before = larger.asked.chosen
-    simulator = Simulator(extended(environment, placed), logs.windows.simulator.num_threads)
+    simulator = Simulator(extended(environment, _extensions(put)), logs.windows.simulator.num_threads)
     windows = Windows(every.settings, simulator, every.trajectories, every)
     windows.budget = every.budget - every.rollouts
     believed = beside(prior, simulator.space)
@@ -190,32 +208,36 @@ def _grown(larger: _Larger, logs: ProbedLogs, prior: Posterior, kept: Kept, step
     if fitted is None:
         return None
     asked = AskedWindows.at(fitted.at, windows, quadratic)
-    return _Larger((*larger.placed, *placed), asked, believed, fitted.agreement)
+    return _Larger((*larger.probes, *put), asked, believed, fitted.agreement)
 
 
-def _placed(logs: ProbedLogs, causes: Causes, environment: MjcfEnvironment) -> tuple[list[Placed], FloatArray]:
-    """Extensions of causes that a model can have together, and theta (N + P,) with them.
+def _placed(logs: ProbedLogs, causes: Causes, environment: MjcfEnvironment) -> tuple[list[Probe], FloatArray]:
+    """A probe of each extension that a model can have together, and theta (N + P,) with them.
 
-    The surest first, then those that explain about as much as the best by themselves.
+    The surest causes first, then those that explain about as much as the best by themselves.
     """
     n, sizes = logs.windows.num_theta, causes.sizes(logs)
     sure = np.abs(causes.step[n:]) / np.sqrt(np.diag(causes.covariance))
-    placed: list[Placed] = []
+    first: list[Probe] = []
     away: dict[str, FloatArray] = {}
     rivals = (k for k, probe in enumerate(logs.probes) if probe.name in alike(logs.at_scatter))
     for k in dict.fromkeys([*causes.kept[np.argsort(-sure)].tolist(), *rivals]):
         probe = logs.probes[k]
-        if probe.placed is None:
+        if probe.placed is None or probe.by_log:
             continue
         if probe.placed.label not in away:
-            if not _can_have(environment, [*placed, probe.placed]):
+            if not _can_have(environment, _extensions([*first, probe])):
                 continue
-            placed.append(probe.placed)
+            first.append(probe)
             away[probe.placed.label] = np.zeros(len(probe.step))
         away[probe.placed.label] += sizes[k] * np.array(probe.step)
     theta = np.clip(logs.theta + causes.step[:n] + logs.traded(sizes), 0, 1)
-    own = [np.clip(one.plain + away[one.label], _INSIDE, 1 - _INSIDE) for one in placed]
-    return placed, np.concatenate([theta, *own])
+    own = [np.clip(one.plain + away[one.label], _INSIDE, 1 - _INSIDE) for one in _extensions(first)]
+    return first, np.concatenate([theta, *own])
+
+
+def _extensions(probes: Sequence[Probe]) -> list[Placed]:
+    return [probe.placed for probe in probes if probe.placed is not None]
 
 
 def _can_have(environment: MjcfEnvironment, placed: Sequence[Placed]) -> bool:
@@ -239,21 +261,22 @@ def _draws(own: GaussianMixture, seed: int) -> Particles:
     return Particles(own.sample((4000,), generator=torch.Generator().manual_seed(seed)), own.space)
 
 
-def _stands(larger: _Larger, logs: ProbedLogs) -> bool:
-    """Whether the larger model is followed in most windows, at their optimum, and groups of them agree."""
+def _stands(larger: _Larger, logs: ProbedLogs, before: int, options: LargerModelOptions) -> bool:
+    """Whether the larger model is at the optimum of most windows, no fewer than before, and groups of them agree."""
     n, left = logs.windows.num_theta, _normal(logs, larger.prior).mode.numpy() - logs.theta
-    precision = logs.arrow.precision[:n, :n] + logs.inner
+    precision, followed = logs.arrow.precision[:n, :n] + logs.inner, larger.asked.windows.num_windows
     settled = 0.5 * float(left @ precision @ left) <= WindowTuning().most_drift
-    most = larger.asked.windows.num_windows >= FOLLOWED.most * larger.asked.among
-    return settled and most and larger.agreement >= FOLLOWED.apart
+    many = followed >= max(FOLLOWED.most * larger.asked.among, before)
+    return settled and many and larger.agreement >= options.agree
 
 
 def _there(larger: _Larger, logs: ProbedLogs, options: LargerModelOptions) -> list[PutIn]:
     """Causes whose parameters are told from the plain model's, by the one that is told best, the surest first."""
-    n = logs.windows.num_theta - sum(len(one.parameters) for one in larger.placed)
+    extensions = _extensions(larger.probes)
+    n = logs.windows.num_theta - sum(len(one.parameters) for one in extensions)
     sd = _normal(logs, larger.prior).stddev.numpy()
     out: list[tuple[float, PutIn]] = []
-    for one in larger.placed:
+    for one, probe in zip(extensions, larger.probes, strict=True):
         own = np.arange(n, n + len(one.parameters))
         n += len(one.parameters)
         sizes = [parameter.default is not None for parameter in one.parameters]  # of others the plain model has none
@@ -263,8 +286,6 @@ def _there(larger: _Larger, logs: ProbedLogs, options: LargerModelOptions) -> li
             continue
         parameter, theta = one.parameters[k], float(logs.theta[own[k]])
         value, low, high = (float(parameter.value(x)) for x in (theta, theta - sd[own[k]], theta + sd[own[k]]))
-        targets = tuple(target for p in one.parameters for target in p.targets)
-        out.append(
-            (float(away[k]), PutIn(one.sentence, parameter.name, value, (high - low) / 2, parameter.unit, targets))
-        )
+        cause = PutIn(one.sentence, parameter.name, value, (high - low) / 2, parameter.unit, probe.remedy)
+        out.append((float(away[k]), cause))
     return [cause for _, cause in sorted(out, key=lambda pair: -pair[0])]
