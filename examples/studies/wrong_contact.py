@@ -149,6 +149,7 @@ def fitted(name: str, effect: str, seed: int) -> Iterator[dict[str, Any]]:
             "ends": {
                 "plain": ends(posterior),
                 "lacking": ends(posterior if further is None else further.further),
+                "first order": ends(posterior if missing is None else missing.further),
             },
             "causes": [] if missing is None else list(missing.causes),
             "fit_s": round(fit_s, 1),

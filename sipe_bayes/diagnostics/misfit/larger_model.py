@@ -7,10 +7,11 @@ their optimum, are looked for from where the linear model points (``laplace.wind
 for each other the simulation then tells which it is: the others' sizes end at nothing. What is left is asked again, and
 what it looks like put in beside, ``rounds`` times at most.
 
-Where the larger model follows most windows, and as many as the plain one, groups of them agree, and its residuals pass for noise, theta is that of
-the larger model, widened as of any model that seems right (``misfit.library_discrepancy``). Else nothing is said here,
-and what is known to first order stands (``misfit.missing_physics``). Nor is it where no cause is seen by ``seen`` sds:
-what is that small looks like several things, whose sizes no simulation tells.
+Where the larger model follows most windows, and no fewer than the plain one, groups of them agree, and its residuals
+pass for noise, theta is that of the larger model, widened as of any model that seems right
+(``misfit.library_discrepancy``). Else nothing is said here, and what is known to first order stands
+(``misfit.missing_physics``). Nor is it where no cause is seen by ``seen`` sds: what is that small looks like several
+things, whose sizes no simulation tells.
 
 This is a step of forward selection (N. Draper, H. Smith, "Applied Regression Analysis", 1966, chapter 6), several at
 once, for the score tests of ``misfit.misspecification``. It does not compare rivals by their evidence, as ``sipe
