@@ -32,7 +32,7 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.diagnostics.misfit.asked_windows import AskedWindows
 from sipe_bayes.diagnostics.misfit.causes import Causes
 from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
-from sipe_bayes.diagnostics.misfit.misspecification import alike, misfit
+from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances
 from sipe_bayes.diagnostics.put_in import PutIn
@@ -60,8 +60,10 @@ class LargerModelOptions(Options):
     """When causes are put in, and count as there."""
 
     rounds: int = option(2, "in which what is left is put in, too", least=1)
-    seen: float = option(10.0, "from none, to first order: a smaller cause is not put in", "sds", above=0)
+    seen: float = option(5.0, "from none, to first order: a smaller cause is not put in", "sds", above=0)
     told: float = option(3.0, "from none, from which a cause that was put in is there", "sds", above=0)
+    rival: float = option(0.5, "of what the best cause explains, from which others are put in beside it", above=0)
+    most: int = option(6, "that are put in at once", least=1)
     agree: float = option(0.05, "chance that groups of windows ask for as different values, at least", above=0)
     steps: int = option(12, "towards the optimum of the windows that are followed: there are more unknowns", least=1)
 
@@ -146,7 +148,7 @@ def larger_model(
         within = kept.under(f"larger-{number}")
         tell(f"putting in what the residuals look like, round {number + 1} of at most {options.rounds}")
         try:
-            grown = _grown(larger, logs, prior, within, options.steps)
+            grown = _grown(larger, logs, prior, within, options)
         except np.linalg.LinAlgError:
             return None
         if grown is None:
@@ -182,13 +184,15 @@ def _looks(
     return replace(looks, cause=cause, remedy=remedy, share=share, shift=shift, alike=1, searchable=False)
 
 
-def _grown(larger: _Larger, logs: ProbedLogs, prior: Posterior, kept: Kept, steps: int) -> _Larger | None:
+def _grown(
+    larger: _Larger, logs: ProbedLogs, prior: Posterior, kept: Kept, options: LargerModelOptions
+) -> _Larger | None:
     """With what the evidence keeps put in beside; None where that is nothing, or too few windows are followed then."""
     environment = logs.windows.simulator.environment
     if larger.asked.chosen is None or not isinstance(environment, MjcfEnvironment):
         return None
     causes = Causes.of(logs)
-    put, theta = _placed(logs, causes, environment)
+    put, theta = _placed(logs, causes, environment, options)
     if not put:
         return None
     every, before = larger.asked.chosen
@@ -200,7 +204,7 @@ def _grown(larger: _Larger, logs: ProbedLogs, prior: Posterior, kept: Kept, step
 
     def made(kept: Kept) -> tuple[_Fitted, ...]:
         starts = mapped_starts(every.simulator.model, simulator.model, before.starts)
-        noise, tuning = logs.beside_scatter(before.noise), replace(FOLLOWED, rounds=1 + steps)
+        noise, tuning = logs.beside_scatter(before.noise), replace(FOLLOWED, rounds=1 + options.steps)
         look = followed_windows(windows, theta, starts, noise, quadratic, tuning)
         return () if isinstance(look, Doubt) else (_Fitted(look.at, agreement(look, GrowingTuning().groups)),)
 
@@ -212,22 +216,25 @@ def _grown(larger: _Larger, logs: ProbedLogs, prior: Posterior, kept: Kept, step
     return _Larger((*larger.probes, *put), asked, believed, fitted.agreement)
 
 
-def _placed(logs: ProbedLogs, causes: Causes, environment: MjcfEnvironment) -> tuple[list[Probe], FloatArray]:
+def _placed(
+    logs: ProbedLogs, causes: Causes, environment: MjcfEnvironment, options: LargerModelOptions
+) -> tuple[list[Probe], FloatArray]:
     """A probe of each extension that a model can have together, and theta (N + P,) with them.
 
-    The surest causes first, then those that explain about as much as the best by themselves.
+    The surest causes first, then those that explain about as much as the best, each by itself.
     """
     n, sizes = logs.windows.num_theta, causes.sizes(logs)
-    sure = np.abs(causes.step[n:]) / np.sqrt(np.diag(causes.covariance))
+    sure = np.argsort(-np.abs(causes.step[n:]) / np.sqrt(np.diag(causes.covariance)))
+    square = logs.at_scatter.seen.score**2 / logs.at_scatter.seen.information
+    rivals = [k for k in np.argsort(-square).tolist() if square[k] >= options.rival * square.max()]
     first: list[Probe] = []
     away: dict[str, FloatArray] = {}
-    rivals = (k for k, probe in enumerate(logs.probes) if probe.name in alike(logs.at_scatter))
-    for k in dict.fromkeys([*causes.kept[np.argsort(-sure)].tolist(), *rivals]):
+    for k in dict.fromkeys([*causes.kept[sure].tolist(), *rivals]):
         probe = logs.probes[k]
         if probe.placed is None or probe.by_log:
             continue
         if probe.placed.label not in away:
-            if not _can_have(environment, _extensions([*first, probe])):
+            if len(first) >= options.most or not _can_have(environment, _extensions([*first, probe])):
                 continue
             first.append(probe)
             away[probe.placed.label] = np.zeros(len(probe.step))

@@ -167,12 +167,6 @@ class _Named:
         return Misfit(p, cause, remedy, name, windows.fitted[channel], *span, shares, shift)
 
 
-def alike(logs: ProbedLogs) -> list[str]:
-    """Names of the probe that explains most and of other causes that explain about as much, best first."""
-    square = logs.seen.score**2 / logs.seen.information
-    return [probe.name for probe in _alike(logs, int(square.argmax()))] if len(square) else []
-
-
 def _alike(logs: ProbedLogs, probe: int) -> list[Probe]:
     """A probe and those of other causes that explain about as much, best first."""
     square = logs.seen.score**2 / logs.seen.information
