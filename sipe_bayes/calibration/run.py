@@ -72,8 +72,7 @@ def calibrate(
     began = time.monotonic()
     method = method_of(problem, estimator, seed, budget, checkpoint, progress)
     posterior, checks = _fitted(problem, method, checkpoint, progress)
-    theta, space = most_probable(posterior), problem.environment.space
-    logs = tamed(problem.train, method)
+    theta, space, logs = most_probable(posterior), problem.environment.space, tamed(problem.train, method)
     problem = from_fitted_states(problem, method)
     fit = Fit.of(problem, method, theta, checks)
     problem = replace(problem, train=tamed(problem.train, method))
@@ -83,8 +82,7 @@ def calibrate(
     misfit, missing = lacks.misfit, lacks.physics(space)
     doubted = conflict is not None or (misfit is not None and misfit.alarm)
     marginals = Marginals.of(posterior, problem.prior, method.seed, bounded_by_nature(problem.simulator.model, space))
-    further = lacks.further(space)
-    summaries = marginals.summaries(further, apart=bool(lacks.put_in))
+    summaries = marginals.summaries(lacks.further(space), apart=bool(lacks.put_in))
     predictions = Predictions.of(problem, theta, checks)
     outside = place_in_prior(problem, method, fit, predictions, checks)
     bands = predictions.bands(posterior, missing if doubted else None, method.seed, checks)
@@ -113,7 +111,7 @@ def calibrate(
         prior=problem.prior,
         parameters=summaries,
         causes=() if missing is None else missing.causes,
-        further=further,
+        further=lacks.further(space),
         put_in=lacks.put_in,
         train=predictions.train,
         holdout=predictions.holdout,

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass, field
 from sipe_bayes.core import view
 from sipe_bayes.core.findings import Code, Finding, Findings
 from sipe_bayes.core.html import Page, html_table
+from sipe_bayes.diagnostics.misfit.put_in import PutIn
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
-from sipe_bayes.diagnostics.put_in import PutIn
 from sipe_bayes.diagnostics.records import (
     BandCoverage,
     ChannelNoise,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from sipe_bayes.core.finding_texts import TEXTS
 from sipe_bayes.core.findings import Code, Findings
 from sipe_bayes.core.thresholds import THRESHOLDS
-from sipe_bayes.diagnostics.put_in import PutIn
+from sipe_bayes.diagnostics.misfit.put_in import PutIn
 from sipe_bayes.diagnostics.records import BandCoverage, ChannelScore, Comparison
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.report.words import listed, number, significant, unit_text

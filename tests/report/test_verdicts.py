@@ -6,6 +6,7 @@ import math
 import pytest
 
 from sipe_bayes.core.findings import Code, Finding, Findings, Severity
+from sipe_bayes.diagnostics.misfit.put_in import PutIn
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
 from sipe_bayes.diagnostics.records import (
     BandCoverage,
@@ -201,6 +202,27 @@ def test_what_the_model_lacks_says_where_values_would_be(calibration: Calibratio
         "Whether the model lacks something was not asked: it follows too few windows, or slips; values may lie beyond "
         "their intervals.",
     )
+
+
+def test_what_was_put_into_the_model_is_said_with_its_size(calibration: Calibration) -> None:
+    """Then the first intervals are of that model, not of what differs between logs."""
+    put = PutIn("dry friction at hinge", "hinge.dry_friction", 0.19782, 0.00086, "N m", "add joint:hinge.frictionloss")
+    slip = PutIn("slip at wheel", "wheel.slip", 0.1001, 0.0042, "1", "add it")
+    named = dataclasses.replace(LACKS, cause="dry friction at hinge", searchable=False)
+    given = dataclasses.replace(
+        calibration, misfit=named, put_in=(put, slip), findings=(noticed(Code.MISFIT_SHIFTS, "p1"),), causes=("drag",)
+    )
+    given = dataclasses.replace(given, parameters=[dataclasses.replace(parameter(0.9), further=(0.5, 1.5))])
+    said = judged.lack(given)
+    assert said is not None
+    assert said.tone == "fair"
+    assert "it looks like dry friction at hinge (40 % of the residual of angle_0, p = 0.005)." in said.text
+    size = "Put into the model (hinge.dry_friction 0.19782 ± 0.0009 N m and wheel.slip 0.1001 ± 0.004)"
+    assert size in said.text
+    assert said.text.endswith("it leaves nothing but noise: the first intervals are of that model.")
+    assert judged.between_logs(given) is None
+    assert judged.between_logs(dataclasses.replace(given, put_in=())) is not None
+    assert [row["parameter"] for row in given.to_dict()["put_in"]] == ["hinge.dry_friction", "wheel.slip"]
 
 
 def test_headline_counts_without_nuisance_parameters() -> None:

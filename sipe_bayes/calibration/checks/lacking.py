@@ -21,8 +21,8 @@ from sipe_bayes.diagnostics.misfit.larger_model import LargerModel, larger_model
 from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics, spread_alone
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import MISFIT, ProbedLogs
+from sipe_bayes.diagnostics.misfit.put_in import PutIn
 from sipe_bayes.diagnostics.misfit.tolerances import tolerance_findings, untold
-from sipe_bayes.diagnostics.put_in import PutIn
 from sipe_bayes.diagnostics.records import Misfit, Residual
 from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.inference.base import Estimator

@@ -34,8 +34,8 @@ from sipe_bayes.diagnostics.misfit.causes import Causes
 from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
+from sipe_bayes.diagnostics.misfit.put_in import PutIn
 from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances
-from sipe_bayes.diagnostics.put_in import PutIn
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.options import GrowingTuning, WindowTuning

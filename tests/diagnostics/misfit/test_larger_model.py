@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
+from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.misfit import larger_model as module
 from sipe_bayes.diagnostics.misfit.asked_windows import AskedWindows
 from sipe_bayes.diagnostics.misfit.larger_model import LargerModel, LargerModelOptions, larger_model
+from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.inference.laplace.windows.followed import FollowedLook
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.posterior import GaussianMixture, prior
-from sipe_bayes.structure.extension import extended
-from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.registry import EXTENSIONS
 from tests.problems.buffers import TRUTH, everything, look_at, machine, recorded
 
 FRICTION = 0.2
@@ -36,15 +34,16 @@ class Asked:
     looks: Misfit
     plain: GaussianMixture
 
-    def larger(self, kept: Kept = NOTHING_KEPT, options: LargerModelOptions | None = None) -> LargerModel | None:
-        options = options or LargerModelOptions()
-        return larger_model(
-            self.asked, self.probed, self.looks, self.plain, prior(machine().space), kept=kept, options=options
-        )
+    def larger(self, kept: Kept = NOTHING_KEPT, **options: float) -> LargerModel | None:
+        """With options of the search."""
+        believed = prior(machine().space)
+        given = LargerModelOptions(**options)  # type: ignore[arg-type]
+        return larger_model(self.asked, self.probed, self.looks, self.plain, believed, kept=kept, options=given)
 
 
-def asked_of(friction: float, seed: int = 0) -> Asked:
-    whole = everything(recorded(friction, seed=seed))
+def asked_of(logs: Trajectories) -> Asked:
+    """Of all windows that the plain model follows."""
+    whole = everything(logs)
     some = look_at(whole)
     assert isinstance(some, FollowedLook)
     space = machine().space
@@ -57,10 +56,81 @@ def asked_of(friction: float, seed: int = 0) -> Asked:
 
 @pytest.fixture(scope="module")
 def wrong() -> Asked:
-    return asked_of(FRICTION)
+    """A machine with dry friction that its model lacks."""
+    return asked_of(recorded(FRICTION, seed=2))
 
 
 def test_missing_friction_is_put_in_and_theta_is_where_it_should_be(wrong: Asked) -> None:
+    """The plain estimate of the damping is twenty sds off; friction and damping of so short logs are a ridge."""
     larger = wrong.larger()
     assert larger is not None
-    print(larger.causes, larger.further.quantile([0.05, 0.95]), larger.looks)
+    (friction,) = larger.causes
+    assert friction.cause == "dry friction at ram"
+    assert "joint:ram.frictionloss" in friction.remedy
+    assert friction.unit == "N"
+    assert 0 < friction.sd < 0.1 * 1.0
+    assert abs(friction.value - FRICTION) < 4 * friction.sd
+    low, high = larger.further.quantile([0.002, 0.998]).numpy()
+    assert ((low < TRUTH) & (high > TRUTH)).all()
+    assert abs(wrong.asked.theta[0] - TRUTH[0]) > 0.3
+    middle = larger.further.mean.numpy()
+    first = missing_physics(wrong.probed, wrong.plain, prior(machine().space), True)
+    assert first is not None
+    assert abs(middle[0] - TRUTH[0]) < 0.5 * abs(first.further.mean.numpy()[0] - TRUTH[0])
+    assert larger.looks.cause == friction.cause
+    assert (larger.looks.alike, larger.looks.searchable, larger.looks.alarm) == (1, False, True)
+    assert larger.looks.shift["ram_damping"] < -10
+    assert 0.1 < larger.looks.share["joint:ram.position"] < 0.4
+
+
+def test_what_leaves_more_than_noise_or_is_not_told_is_not_put_in(
+    wrong: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both ways beside the test above."""
+    assert wrong.larger(agree=0.5) is None
+    assert wrong.larger(told=1e3) is None
+
+    def never(*_: object) -> None:
+        raise AssertionError("put in")
+
+    monkeypatch.setattr(module, "_grown", never)
+    assert wrong.larger(seen=20.0) is None
+    right = asked_of(recorded(seed=2))
+    assert not right.looks.alarm
+    assert right.larger(seen=1e-3) is None
+    assert replace(wrong, looks=replace(wrong.looks, p=1.0)).larger() is None
+
+
+def test_windows_that_were_not_chosen_get_nothing_put_in(wrong: Asked) -> None:
+    """Of smooth motion ``sipe discover`` compares structures by their evidence."""
+    assert replace(wrong, asked=replace(wrong.asked, chosen=None)).larger() is None
+
+
+def test_what_is_left_is_put_in_beside() -> None:
+    """A force that the log does not have, and friction: one cause at a time, in two rounds but not in one."""
+    logs = recorded(FRICTION, seed=2)
+    pushed = asked_of(replace(logs, actions=logs.actions - 0.05))
+    assert pushed.larger(most=1, rounds=1, rival=1.0) is None
+    larger = pushed.larger(most=1, rival=1.0)
+    assert larger is not None
+    assert len(larger.causes) == 2
+    assert "an offset of push" in larger.looks.cause
+    assert " and " in larger.looks.cause
+    low, high = larger.further.quantile([0.002, 0.998]).numpy()
+    assert ((low < TRUTH) & (high > TRUTH)).all()
+
+
+def test_a_round_that_is_kept_is_not_made_again(wrong: Asked, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = wrong.larger(Kept(tmp_path, "this run"))
+
+    def never(*_: object) -> None:
+        raise AssertionError("fitted again")
+
+    monkeypatch.setattr(module, "followed_windows", never)
+    after = wrong.larger(Kept(tmp_path, "this run"))
+    assert before is not None
+    assert after is not None
+    assert after.causes == before.causes
+    np.testing.assert_array_equal(after.further.theta, before.further.theta)
+    with pytest.raises(AssertionError, match="fitted again"):
+        wrong.larger(Kept(tmp_path, "another run"))
