@@ -270,14 +270,15 @@ def lack(calibration: Calibration) -> Verdict | None:
         return Verdict("fair", f"Whether the model lacks something was not asked: {few}.")
     if misfit is None or not misfit.alarm:
         return None
+    if put := [_put(cause) for cause in calibration.put_in]:
+        text = (
+            f"The model lacks something. With {_few(put)} put in it leaves nothing but noise: the first intervals are"
+        )
+        return Verdict("fair", f"{text} of that model.")
     share = f"{number(100 * misfit.share[misfit.channel], 2)} % of the residual of {misfit.channel}"
     if not misfit.matters:
         return Verdict("fair", f"The model lacks something small: it looks like {misfit.cause} ({share}).")
     text = f"The model lacks something: it looks like {misfit.cause} ({share}, {misfit.p_text})."
-    if calibration.put_in:
-        sizes = listed([_size(cause) for cause in calibration.put_in[:_DOUBTS]])
-        put = f"{text} Put into the model ({sizes}) it leaves nothing but noise: the first intervals are of that model."
-        return Verdict("fair", put)
     text += " `sipe discover` tries it." if misfit.shift and misfit.searchable else ""
     if misfit.alike > 1:  # with which of them values would move is open
         return Verdict("bad", text)
@@ -293,10 +294,10 @@ def lack(calibration: Calibration) -> Verdict | None:
     return Verdict("bad", text)
 
 
-def _size(cause: PutIn) -> str:
-    """Of what was put in."""
-    value = significant(cause.value, cause.sd)
-    return f"{cause.parameter} {value} ± {number(cause.sd, 1)} {unit_text(cause.unit)}".rstrip()
+def _put(cause: PutIn) -> str:
+    """What was put in, with its size."""
+    size = f"{significant(cause.value, cause.sd)} ± {number(cause.sd, 1)} {unit_text(cause.unit)}".rstrip()
+    return f"{cause.cause} ({size})"
 
 
 def _led_out(calibration: Calibration, name: str, sds: float) -> bool:
