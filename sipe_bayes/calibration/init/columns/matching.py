@@ -13,7 +13,7 @@ from sipe_bayes.calibration.init.columns.match import SURE, Match, Matches
 from sipe_bayes.calibration.init.columns.names import Kind, Label, alike, is_exactly, number_of, pieces_of, read_name
 from sipe_bayes.calibration.init.columns.signals import slope_of
 from sipe_bayes.calibration.init.columns.vectors import held_open, match_vectors
-from sipe_bayes.calibration.init.columns.vocabulary import LETTERS, OF_BODIES, OF_NO_JOINT
+from sipe_bayes.calibration.init.columns.vocabulary import COMMANDS, LETTERS, OF_BODIES, OF_NO_JOINT
 from sipe_bayes.calibration.init.machine import Actuator, Drive, Joint, Machine
 from sipe_bayes.core.arrays import FloatArray
 
@@ -98,9 +98,11 @@ def _falls(values: FloatArray) -> bool:
 def _own_words(machine: Machine) -> set[str]:
     """Words of quantities that are none here: a joint is called so, or nothing has an inertial unit.
 
-    Of these ``gx`` and ``ax`` are short enough to be anything.
+    Of these ``gx`` and ``ax`` are short enough to be anything; ``drive`` is a joint's where no actuator is called so.
     """
-    own = {piece for joint in machine.joints for piece in pieces_of(joint.name)} & {*OF_BODIES, *LETTERS, *OF_NO_JOINT}
+    joints = {piece for joint in machine.joints for piece in pieces_of(joint.name)}
+    driving = {actuator.name for actuator in machine.actuators}
+    own = joints & {*OF_BODIES, *LETTERS, *OF_NO_JOINT, *(COMMANDS - driving)}
     sensors = {kind for _, kind in machine.sensors}
     for kind, letter in (("gyro", "g"), ("accelerometer", "a")):
         if not machine.bodies and kind not in sensors:

@@ -192,6 +192,27 @@ def test_the_one_command_drives_the_one_actuator_whatever_it_is_called(columns: 
     assert [m.column for m in matches.commands] == [driving] * (driving is not None)
 
 
+SLIDE = """<mujoco><worldbody><body name="cart"><joint name="drive" type="slide"/><geom size=".1" mass="1"/></body>
+</worldbody><actuator><motor name="{name}" joint="drive"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("actuator", "columns", "driving", "measured"),
+    [
+        ("force", ["force [N]", "drive [m]"], "force [N]", ["drive [m]"]),
+        ("motor_drive", ["drive_cmd", "drive_pos"], "drive_cmd", ["drive_pos"]),
+        ("push", ["u", "drive"], "u", ["drive"]),
+        ("drive", ["drive", "cart [m]"], "drive", ["cart [m]"]),  # an actuator that is called so
+    ],
+)
+def test_a_word_for_commands_that_a_joint_is_called_by_is_its_name(
+    actuator: str, columns: list[str], driving: str, measured: list[str]
+) -> None:
+    matches = matched(Machine.of(mujoco.MjModel.from_xml_string(SLIDE.format(name=actuator))), columns)
+    assert [m.column for m in matches.commands] == [driving]
+    assert [m.column for m in matches.positions] == measured
+
+
 def test_ticks_that_go_back_are_a_joints_and_no_clock() -> None:
     """`beam` is the body of the joint; a clock of ticks only rises."""
     machine, rows = Machine.of(mujoco.MjModel.from_xml_string(BEAM.format(kind="motor"))), np.arange(30.0)
