@@ -110,7 +110,7 @@ def calibrate(
         posterior=posterior,
         prior=problem.prior,
         parameters=summaries,
-        causes=() if missing is None else missing.causes,
+        causes=lacks.causes,
         further=lacks.further(space),
         put_in=lacks.put_in,
         train=predictions.train,

@@ -57,7 +57,8 @@ class ParameterSummary:
         contraction: 1 - sd / prior sd.
         nuisance: whether it holds for one log alone.
         further: (2,) 5 and 95 % quantiles with what the model may lack; where the logs ask for different values or the
-            model lacks something, of what a further log would ask for. None where neither can be said.
+            model lacks something, of what a further log would ask for, or of the model with what it lacks put in, which
+            need not hold the others. None where neither can be said.
         known: whether the prior alone determines it well, and the logs do not say otherwise.
     """
 
@@ -101,7 +102,7 @@ class Calibration:
         misfit: what the residuals look like; None where they could not be looked at.
         outside: of each training log, whether the prior gives such a one.
         noise: of each fitted channel.
-        causes: for which the parameters' ``further`` allow, to first order.
+        causes: for which the parameters' ``further`` allow, to first order; none where they were put in.
         further: theta with what the model lacks or may lack, of which the parameters' ``further`` are the intervals;
             None where nothing can be said.
         put_in: what was put into the model, of which ``further`` then is; none where nothing was, or not all was found.

@@ -110,7 +110,7 @@ def _stretched(calibration: Calibration, further: Particles) -> Particles:
 
 
 def _with_plain(calibration: Calibration, further: Particles) -> Particles:
-    """Theta of the model that has what this one lacks, and in equal parts that as which this one moves most alike."""
+    """Theta of the model that has what this one lacks, and in equal parts the plain posterior."""
     plain = calibration.posterior.sample((len(further.theta),), generator=torch.Generator().manual_seed(0))
     weights = further.weights / further.weights.sum()
     equal = torch.full_like(weights, 1 / len(weights))

@@ -110,7 +110,7 @@ def _with_what_is_lacking(parameter: ParameterSummary, findings: Findings) -> Ve
         return Verdict("bad", "not determined")
     if _doubts(findings, [parameter]):
         return Verdict("fair", "doubted above, not to be used yet")
-    return Verdict("fair", "within the wider interval")
+    return Verdict("fair", "within the first interval")
 
 
 def _wide(parameter: ParameterSummary, contraction: float = THRESHOLDS.not_determined) -> bool:

@@ -64,7 +64,8 @@ class Probe:
             alone tell that number.
         trade: (N,) by which it changes theta itself at size 1, and with the root of any other; none where not at all.
         placed: the extension at that site; None of what has no parameters.
-        step: (P,) by which size 1 changes theta of its parameters, in proportion.
+        tried: (P,) theta of its parameters where it was simulated.
+        size: that it then has.
     """
 
     name: str
@@ -75,7 +76,8 @@ class Probe:
     whole: float = math.nan
     trade: tuple[float, ...] = ()
     placed: Placed | None = field(default=None, compare=False)
-    step: tuple[float, ...] = ()
+    tried: tuple[float, ...] = ()
+    size: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -174,7 +176,8 @@ def _named(effect: Effect) -> list[Probe]:
         remedy = f"let `sipe discover` put it in (--only {placed.extension.name})"
     probe = Probe(placed.sentence, remedy, by_log, placed.site, placed.extension, placed=placed)
     size, away = _size(effect.change), effect.probes - placed.plain
-    named = [replace(probe, step=tuple(row)) for row in (away / size[:, None]).tolist()]
+    tried = zip(effect.probes.tolist(), size.tolist(), strict=True)
+    named = [replace(probe, tried=tuple(row), size=own) for row, own in tried]
     if effect.trades.any():
         sized = effect.trades / np.sqrt(size)[:, None]
         return [replace(one, trade=tuple(row)) for one, row in zip(named, sized.tolist(), strict=True)]

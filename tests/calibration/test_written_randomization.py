@@ -71,7 +71,7 @@ def test_what_is_read_back_is_what_was_written(case: tuple[Calibration, Path, di
 def test_train_says_what_is_not_calibrated(tmp_path: Path) -> None:
     space = sipe.make_task("Pendulum").space
     prior(space).save(tmp_path / "drawn")
-    rows = [{"name": name, "usable": "wider", "reason": "within the wider interval"} for name in space.names]
+    rows = [{"name": name, "usable": "wider", "reason": "within the first interval"} for name in space.names]
     rows[0] |= {"usable": "none", "reason": "at a bound"}
     file = tmp_path / "domain_randomization.json"
     file.write_text(json.dumps({"parameters": rows, "posterior": "drawn"}))

@@ -285,7 +285,7 @@ def test_a_model_that_lacks_something_is_used_for_what_it_can_do() -> None:
     wide = dataclasses.replace(parameter(0.9), name="damping", further=(0.2, 2.2))
     misfits = [noticed(Code.MISFIT, name) for name in ("mass", "damping")]
     lacks = Findings([noticed(Code.LOGS_DISAGREE, "mass", severity=Severity.BLOCKING), *misfits])
-    assert judged.parameter_verdict(narrow, lacks) == judged.Verdict("fair", "within the wider interval")
+    assert judged.parameter_verdict(narrow, lacks) == judged.Verdict("fair", "within the first interval")
     assert judged.parameter_verdict(wide, lacks).tone == "bad"
     held = BandCoverage(0.88, 0.03, 20, {"angle": (0.02, "rad")})
     expected = (

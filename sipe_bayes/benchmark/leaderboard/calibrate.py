@@ -1,9 +1,10 @@
 """The method ``calibrate``: ``laplace`` with what the model lacks or may lack, which ``sipe calibrate`` shows first.
 
-That is the interval of ``diagnostics.misfit.missing_physics``. Where the residuals are no noise it asks for windows: a
-log that was fitted whole from its known start is fitted again in windows of half a second, within the same budget. Only
-of a user's MJCF, which extensions are made for; elsewhere it is ``laplace``. Of a simulator that makes its own noise
-there is no likelihood: there it is what ``laplace`` then names in its place, ``npe``, mended by held-back simulations.
+That is the interval of ``diagnostics.misfit.missing_physics``; nothing is put into a model here. Where the residuals are
+no noise it asks for windows: a log that was fitted whole from its known start is fitted again in windows of half a
+second, within the same budget. Only of a user's MJCF, which extensions are made for; elsewhere it is ``laplace``. Of a
+simulator that makes its own noise there is no likelihood: there it is what ``laplace`` then names in its place,
+``npe``, mended by held-back simulations.
 
 Held-out logs are predicted with the most probable values of the first fit, as ``sipe calibrate`` does: where physics
 are missing, the model does not predict best with the machine's own values, which that interval is about.

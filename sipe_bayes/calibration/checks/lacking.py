@@ -85,6 +85,11 @@ class Lacking:
         """What was put into the model."""
         return () if self.larger is None else self.larger.causes
 
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """For which ``further`` allows; none where they were put in."""
+        return () if self.missing is None or self.larger is not None else self.missing.causes
+
     def physics(self, space: ParameterSpace) -> MissingPhysics | None:
         """What the model lacks, or may lack, to first order."""
         if self.missing is None:

@@ -7,7 +7,7 @@ their optimum, are looked for from where the linear model points (``laplace.wind
 for each other the simulation then tells which it is: the others' sizes end at nothing. What is left is asked again, and
 what it looks like put in beside, ``rounds`` times at most.
 
-Where the larger model follows most windows, and no fewer than the plain one, groups of them agree, and its residuals
+Where the larger model follows most windows, about as many as the plain one, groups of them agree, and its residuals
 pass for noise, theta is that of the larger model, widened as of any model that seems right
 (``misfit.library_discrepancy``). Else nothing is said here, and what is known to first order stands
 (``misfit.missing_physics``). Nor is it where no cause is seen by ``seen`` sds: what is that small looks like several
@@ -49,7 +49,7 @@ from sipe_bayes.posterior import GaussianMixture, Particles, Posterior
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import Placed, extended
 from sipe_bayes.structure.fitted import beside
-from sipe_bayes.structure.internal_starts import mapped_starts
+from sipe_bayes.structure.internal_starts import carried_starts, mapped_starts
 from sipe_bayes.structure.probes import Probe
 
 _INSIDE = 1e-3  # of the cube, from its faces: where parameters of extensions begin
@@ -60,10 +60,13 @@ class LargerModelOptions(Options):
     """When causes are put in, and count as there."""
 
     rounds: int = option(2, "in which what is left is put in, too", least=1)
-    seen: float = option(5.0, "from none, to first order: a smaller cause is not put in", "sds", above=0)
+    seen: float = option(
+        5.0, "from none, to first order, that the best cause has: else nothing is put in", "sds", above=0
+    )
     told: float = option(3.0, "from none, from which a cause that was put in is there", "sds", above=0)
     rival: float = option(0.5, "of what the best cause explains, from which others are put in beside it", above=0)
     most: int = option(6, "that are put in at once", least=1)
+    share: float = option(0.8, "of the windows that the plain model follows, that it has to follow", above=0)
     agree: float = option(0.05, "chance that groups of windows ask for as different values, at least", above=0)
     steps: int = option(12, "towards the optimum of the windows that are followed: there are more unknowns", least=1)
 
@@ -134,23 +137,37 @@ def larger_model(
         seed: of the draws.
         tolerances: of numbers that no machine has exactly.
         tell: called with what is being done.
-        kept: keeps what each round ended with.
+        kept: keeps what each round simulated.
         options: of the search.
 
     Returns:
         None where nothing is missing, no larger model leaves nothing but noise, or windows do not go through impacts.
     """
-    first = probed.at_scatter.seen
-    if not looks.alarm or not (first.score**2 >= options.seen**2 * first.information).any():
+    if not looks.alarm or asked.chosen is None or _squares(probed).max(initial=0.0) < options.seen**2:
         return None
+    try:
+        return _searched(asked, probed, looks, posterior, prior, seed, tolerances, tell, kept, options)
+    except ValueError:  # LinAlgError is one, and what a larger model raises that diverges
+        return None
+
+
+def _searched(
+    asked: AskedWindows,
+    probed: ProbedLogs,
+    looks: Misfit,
+    posterior: Posterior,
+    prior: Posterior,
+    seed: int,
+    tolerances: Tolerances,
+    tell: Tell,
+    kept: Kept,
+    options: LargerModelOptions,
+) -> LargerModel | None:
     larger, logs = _Larger((), asked, prior, 1.0), probed
     for number in range(options.rounds):
         within = kept.under(f"larger-{number}")
         tell(f"putting in what the residuals look like, round {number + 1} of at most {options.rounds}")
-        try:
-            grown = _grown(larger, logs, prior, within, options)
-        except np.linalg.LinAlgError:
-            return None
+        grown = _grown(larger, logs, prior, within, options)
         if grown is None:
             return None
         larger, logs = grown, grown.asked.probed(tell, within)
@@ -160,9 +177,9 @@ def larger_model(
             break
     else:
         return None
-    if not _stands(larger, logs, asked.windows.num_windows, options):
+    if not _stands(larger, logs, own, asked, options):
         return None
-    causes = tuple(_there(larger, logs, options))
+    causes = tuple(_there(larger, logs, own, options))
     if not causes:
         return None
     missing = missing_physics(logs, own, larger.prior, False, seed, tolerances)
@@ -203,7 +220,8 @@ def _grown(
     quadratic = QuadraticPrior.of(believed)
 
     def made(kept: Kept) -> tuple[_Fitted, ...]:
-        starts = mapped_starts(every.simulator.model, simulator.model, before.starts)
+        starts = mapped_starts(every.simulator.model, simulator.model, before.starts)[None]
+        starts = carried_starts(every.simulator.model, windows, theta[None], starts)[0]
         noise, tuning = logs.beside_scatter(before.noise), replace(FOLLOWED, rounds=1 + options.steps)
         look = followed_windows(windows, theta, starts, noise, quadratic, tuning)
         return () if isinstance(look, Doubt) else (_Fitted(look.at, agreement(look, GrowingTuning().groups)),)
@@ -225,23 +243,42 @@ def _placed(
     """
     n, sizes = logs.windows.num_theta, causes.sizes(logs)
     sure = np.argsort(-np.abs(causes.step[n:]) / np.sqrt(np.diag(causes.covariance)))
-    square = logs.at_scatter.seen.score**2 / logs.at_scatter.seen.information
-    rivals = [k for k in np.argsort(-square).tolist() if square[k] >= options.rival * square.max()]
+    square = _squares(logs)
+    rivals = [k for k in np.argsort(-square).tolist() if square[k] >= options.rival * square.max() > 0]
     first: list[Probe] = []
-    away: dict[str, FloatArray] = {}
     for k in dict.fromkeys([*causes.kept[sure].tolist(), *rivals]):
         probe = logs.probes[k]
-        if probe.placed is None or probe.by_log:
+        known = any(probe.placed is one for one in _extensions(first))
+        if not _can_be_put_in(probe) or known or len(first) >= options.most:
             continue
-        if probe.placed.label not in away:
-            if len(first) >= options.most or not _can_have(environment, _extensions([*first, probe])):
-                continue
+        if _can_have(environment, _extensions([*first, probe])):
             first.append(probe)
-            away[probe.placed.label] = np.zeros(len(probe.step))
-        away[probe.placed.label] += sizes[k] * np.array(probe.step)
     theta = np.clip(logs.theta + causes.step[:n] + logs.traded(sizes), 0, 1)
-    own = [np.clip(one.plain + away[one.label], _INSIDE, 1 - _INSIDE) for one in _extensions(first)]
-    return first, np.concatenate([theta, *own])
+    return first, np.concatenate([theta, *(_begun(one, logs, sizes) for one in _extensions(first))])
+
+
+def _begun(placed: Placed, logs: ProbedLogs, sizes: FloatArray) -> FloatArray:
+    """Theta (P,) of an extension whose columns have these sizes (K,): they add up, of shapes it is the mean."""
+    mine = [k for k, probe in enumerate(logs.probes) if probe.placed is placed]
+    tried = np.array([logs.probes[k].tried for k in mine])
+    share = np.array([sizes[k] / logs.probes[k].size for k in mine])
+    if any(logs.probes[k].trade for k in mine):
+        share = np.sqrt(np.maximum(share, 0.0))
+    sized = np.array([parameter.default is not None for parameter in placed.parameters])
+    weight = np.abs(share) if share.any() else np.ones(len(mine))
+    theta = np.where(sized, placed.plain + share @ (tried - placed.plain), weight @ tried / weight.sum())
+    return np.clip(theta, _INSIDE, 1 - _INSIDE)
+
+
+def _squares(logs: ProbedLogs) -> FloatArray:
+    """Score statistics (K,) of the probes by themselves; zero of those that cannot be put in."""
+    seen, able = logs.at_scatter.seen, [_can_be_put_in(probe) for probe in logs.probes]
+    return np.where(able, seen.score**2 / seen.information, 0.0)
+
+
+def _can_be_put_in(probe: Probe) -> bool:
+    """Not shorter physics steps, which are no parameter, nor what one log has by itself."""
+    return probe.placed is not None and not probe.by_log
 
 
 def _extensions(probes: Sequence[Probe]) -> list[Placed]:
@@ -269,31 +306,34 @@ def _draws(own: GaussianMixture, seed: int) -> Particles:
     return Particles(own.sample((4000,), generator=torch.Generator().manual_seed(seed)), own.space)
 
 
-def _stands(larger: _Larger, logs: ProbedLogs, before: int, options: LargerModelOptions) -> bool:
-    """Whether the larger model is at the optimum of most windows, no fewer than before, and groups of them agree."""
-    n, left = logs.windows.num_theta, _normal(logs, larger.prior).mode.numpy() - logs.theta
-    precision, followed = logs.arrow.precision[:n, :n] + logs.inner, larger.asked.windows.num_windows
-    settled = 0.5 * float(left @ precision @ left) <= WindowTuning().most_drift
-    many = followed >= max(FOLLOWED.most * larger.asked.among, before)
+def _stands(
+    larger: _Larger, logs: ProbedLogs, own: GaussianMixture, asked: AskedWindows, options: LargerModelOptions
+) -> bool:
+    """Whether it is at the optimum of most windows, of about as many as the plain model follows, and groups agree."""
+    n, followed = len(asked.theta), larger.asked.windows.num_windows
+    left, covariance = (own.mode.numpy() - logs.theta)[:n], own.covariances[0].numpy()[:n, :n]
+    settled = 0.5 * float(left @ np.linalg.solve(covariance, left)) <= WindowTuning().most_drift
+    many = followed >= max(FOLLOWED.most * larger.asked.among, options.share * asked.windows.num_windows)
     return settled and many and larger.agreement >= options.agree
 
 
-def _there(larger: _Larger, logs: ProbedLogs, options: LargerModelOptions) -> list[PutIn]:
+def _there(larger: _Larger, logs: ProbedLogs, own: GaussianMixture, options: LargerModelOptions) -> list[PutIn]:
     """Causes whose parameters are told from the plain model's, by the one that is told best, the surest first."""
     extensions = _extensions(larger.probes)
     n = logs.windows.num_theta - sum(len(one.parameters) for one in extensions)
-    sd = _normal(logs, larger.prior).stddev.numpy()
+    sd = own.stddev.numpy()
     out: list[tuple[float, PutIn]] = []
     for one, probe in zip(extensions, larger.probes, strict=True):
-        own = np.arange(n, n + len(one.parameters))
+        mine = np.arange(n, n + len(one.parameters))
         n += len(one.parameters)
         sizes = [parameter.default is not None for parameter in one.parameters]  # of others the plain model has none
-        away = np.where(sizes, np.abs(logs.theta[own] - one.plain) / sd[own], 0.0)
+        away = np.where(sizes, np.abs(logs.theta[mine] - one.plain) / sd[mine], 0.0)
         k = int(away.argmax())
         if away[k] < options.told:
             continue
-        parameter, theta = one.parameters[k], float(logs.theta[own[k]])
-        value, low, high = (float(parameter.value(x)) for x in (theta, theta - sd[own[k]], theta + sd[own[k]]))
-        cause = PutIn(one.sentence, parameter.name, value, (high - low) / 2, parameter.unit, probe.remedy)
+        parameter, theta = one.parameters[k], float(logs.theta[mine[k]])
+        value, low, high = (float(parameter.value(x)) for x in (theta, theta - sd[mine[k]], theta + sd[mine[k]]))
+        remedy = probe.remedy if one.edit is None else f"add {one.sentence} to the model"
+        cause = PutIn(one.sentence, parameter.name, value, (high - low) / 2, parameter.unit, remedy)
         out.append((float(away[k]), cause))
     return [cause for _, cause in sorted(out, key=lambda pair: -pair[0])]

@@ -17,6 +17,7 @@ from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.records import Misfit
+from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.windows.followed import FollowedLook
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.posterior import GaussianMixture, prior
@@ -99,6 +100,45 @@ def test_what_leaves_more_than_noise_or_is_not_told_is_not_put_in(
     assert not right.looks.alarm
     assert right.larger(seen=1e-3) is None
     assert replace(wrong, looks=replace(wrong.looks, p=1.0)).larger() is None
+
+
+def test_a_larger_model_that_diverges_is_none(wrong: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is known to first order then stands; the run goes on."""
+
+    def diverges(*_: object) -> ProbedLogs:
+        raise ValueError("theta: the simulation diverges")
+
+    monkeypatch.setattr(AskedWindows, "probed", diverges)
+    assert wrong.larger() is None
+
+
+def test_sizes_add_up_and_shapes_are_where_they_were_tried(wrong: Asked) -> None:
+    """Of Stribeck friction the speed is a shape; what nothing is known of begins in the middle of its shapes."""
+    probes = wrong.probed.probes
+    mine = [k for k, probe in enumerate(probes) if probe.placed is not None and probe.placed.label == "stribeck:ram"]
+    (placed,) = {id(probes[k].placed): probes[k].placed for k in mine}.values()
+    assert placed is not None
+    speeds = [probes[k].tried[1] for k in mine]
+    assert len(set(speeds)) == len(mine) > 1
+    sizes = np.zeros(len(probes))
+    sizes[mine[-1]] = 10 * probes[mine[-1]].size
+    begun = module._begun(placed, wrong.probed, sizes)
+    np.testing.assert_allclose(begun, [10 * probes[mine[-1]].tried[0], speeds[-1]], rtol=1e-6)
+    none = module._begun(placed, wrong.probed, np.zeros(len(probes)))
+    np.testing.assert_allclose(none, [module._INSIDE, np.mean(speeds)], rtol=1e-6)
+
+
+def test_two_that_write_the_same_number_are_not_put_in_together(wrong: Asked) -> None:
+    """The same piece twice stands for two that write one number."""
+    environment = wrong.asked.windows.simulator.environment
+    assert isinstance(environment, MjcfEnvironment)
+    both = {
+        probe.placed.label: probe.placed
+        for probe in wrong.probed.probes
+        if probe.placed is not None and probe.placed.label in ("dry_friction:ram", "gain:push", "mass:ram")
+    }
+    assert module._can_have(environment, list(both.values()))
+    assert not module._can_have(environment, [both["dry_friction:ram"], both["dry_friction:ram"]])
 
 
 def test_windows_that_were_not_chosen_get_nothing_put_in(wrong: Asked) -> None:
