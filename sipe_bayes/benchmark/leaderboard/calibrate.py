@@ -1,7 +1,7 @@
 """The method ``calibrate``: ``laplace`` with what the model lacks or may lack, which ``sipe calibrate`` shows first.
 
-That is the interval of ``diagnostics.misfit.missing_physics``; nothing is put into a model here. Where the residuals are
-no noise it asks for windows: a log that was fitted whole from its known start is fitted again in windows of half a
+That is the interval of ``diagnostics.misfit.missing_physics``; nothing is put into a model here. Where the residuals
+are no noise it asks for windows: a log that was fitted whole from its known start is fitted again in windows of half a
 second, within the same budget. Only of a user's MJCF, which extensions are made for; elsewhere it is ``laplace``. Of a
 simulator that makes its own noise there is no likelihood: there it is what ``laplace`` then names in its place,
 ``npe``, mended by held-back simulations.
