@@ -65,7 +65,7 @@ class Recommended:
         """What whoever draws from it has to know, a line for each kind of draws."""
         lines = []
         if wider := self.names(Usable.WIDER):
-            lines.append(f"Drawn from the intervals with what the model lacks or may lack: {', '.join(wider)}.")
+            lines.append(f"Drawn with what the model lacks or may lack: {', '.join(wider)}.")
         if none := self.names(Usable.NONE):
             reasons = dict.fromkeys(self.bases[name].reason for name in none)
             alike = {reason: [n for n in none if self.bases[n].reason == reason] for reason in reasons}

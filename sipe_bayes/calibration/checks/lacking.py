@@ -49,7 +49,7 @@ class _Missing:
 
 
 @dataclass(frozen=True)
-class _Larger:
+class _WithCauses:
     """Draws (M, N) of a ``LargerModel``'s theta with their weights (M,), and the causes in it."""
 
     theta: FloatArray
@@ -71,7 +71,7 @@ class Lacking:
 
     misfit: Misfit | None
     missing: _Missing | None
-    larger: _Larger | None
+    larger: _WithCauses | None
     residuals: tuple[Residual, ...]
     findings: tuple[Finding, ...]
 
@@ -151,8 +151,8 @@ def _plain(missing: MissingPhysics) -> _Missing:
     return _Missing(further.theta.numpy(), further.weights.numpy(), missing.causes, missing.explained)
 
 
-def _put(larger: LargerModel) -> _Larger:
-    return _Larger(larger.further.theta.numpy(), larger.further.weights.numpy(), larger.causes)
+def _put(larger: LargerModel) -> _WithCauses:
+    return _WithCauses(larger.further.theta.numpy(), larger.further.weights.numpy(), larger.causes)
 
 
 def _probed(

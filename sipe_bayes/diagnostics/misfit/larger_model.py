@@ -192,8 +192,12 @@ def _looks(
     looks: Misfit, posterior: Posterior, before: ProbedLogs, after: ProbedLogs, causes: Sequence[PutIn]
 ) -> Misfit:
     """What the residuals look like, by name of the causes that were put in."""
-    left = (after.noise.sd / before.noise.sd) ** 2
-    share = dict(zip(before.windows.fitted, np.clip(1 - left, 0, 1).tolist(), strict=True))
+    explained = np.clip(1 - (after.noise.sd / before.noise.sd) ** 2, 0, 1)
+    given = ~np.isnan(before.windows.fixed_sd)  # noise that is no estimate says nothing
+    share = {
+        name: looks.share.get(name, 0.0) if fixed else own
+        for name, own, fixed in zip(before.windows.fitted, explained.tolist(), given.tolist(), strict=True)
+    }
     names, n = posterior.space.names, len(posterior.space)
     moved = (after.theta[:n] - posterior.mode.numpy()) / np.maximum(posterior.stddev.numpy(), 1e-12)
     cause, remedy = " and ".join(c.cause for c in causes), " and ".join(c.remedy for c in causes)
