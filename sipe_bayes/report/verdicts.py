@@ -272,7 +272,7 @@ def lack(calibration: Calibration) -> Verdict | None:
         return None
     if put := [_put(cause) for cause in calibration.put_in]:
         text = (
-            f"The model lacks something. With {_few(put)} put in it leaves nothing but noise: the first intervals are"
+            f"The model lacks something. With {_few(put)} put in, it leaves nothing but noise: the first intervals are"
         )
         return Verdict("fair", f"{text} of that model.")
     share = f"{number(100 * misfit.share[misfit.channel], 2)} % of the residual of {misfit.channel}"

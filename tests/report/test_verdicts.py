@@ -218,7 +218,7 @@ def test_what_was_put_into_the_model_is_said_with_its_size(calibration: Calibrat
     assert said.tone == "fair"
     assert said.text == (
         "The model lacks something. With dry friction at hinge (0.19782 ± 0.0009 N m) and slip at wheel (0.1001 ± "
-        "0.004) put in it leaves nothing but noise: the first intervals are of that model."
+        "0.004) put in, it leaves nothing but noise: the first intervals are of that model."
     )
     assert judged.between_logs(given) is None
     assert judged.between_logs(dataclasses.replace(given, put_in=())) is not None
