@@ -188,7 +188,10 @@ ADVICE: dict[Code, str] = {
     Code.NO_MISFIT: "Nothing to do. The cause that is named is the one that would have been looked at first.",
     Code.SMALL_MISFIT: "The values may be used. For a better prediction put the cause into the model.",
     Code.MISFIT: _REMEDY_LACKING,
-    Code.MISFIT_SHIFTS: f"{_REMEDY_LACKING} Until then read the values as those of a model that is wrong, unless the first sentences say that it was put in.",
+    Code.MISFIT_SHIFTS: (
+        f"{_REMEDY_LACKING} Until then read the values as those of a model that is wrong, unless the first sentences "
+        "say that it was put in."
+    ),
     Code.NOISE_DRIFTS: (
         "A model that lacks something leaves such residuals, or a zero that differs between logs: run `sipe discover`. "
         "For predictions compare with "
