@@ -213,10 +213,10 @@ def test_what_was_put_into_the_model_is_said_with_its_size(calibration: Calibrat
         calibration, misfit=named, put_in=(put, slip), findings=(noticed(Code.MISFIT_SHIFTS, "p1"),), causes=("drag",)
     )
     given = dataclasses.replace(given, parameters=[dataclasses.replace(parameter(0.9), further=(0.5, 1.5))])
-    said = judged.lack(given)
-    assert said is not None
-    assert said.tone == "fair"
-    assert said.text == (
+    lacks = judged.lack(given)
+    assert lacks is not None
+    assert lacks.tone == "fair"
+    assert lacks.text == (
         "The model lacks something. With dry friction at hinge (0.19782 ± 0.0009 N m) and slip at wheel (0.1001 ± "
         "0.004) put in, it leaves nothing but noise: the first intervals are of that model."
     )

@@ -136,12 +136,8 @@ def lacking(
             missing = spread_alone(groups, problem.prior, True, method.seed) if groups else spread_alone(alone, *given)
         else:
             missing = missing_physics(probed, posterior, *given, problem.tolerances)
-        kept_missing, kept_larger = (
-            None if missing is None else _plain(missing),
-            None if larger is None else _put(larger),
-        )
-        looks = looks if larger is None else larger.looks
-        return Lacking(looks, kept_missing, kept_larger, tuple(residuals), tuple(unknown))
+        plain, put = None if missing is None else _plain(missing), None if larger is None else _put(larger)
+        return Lacking(looks if larger is None else larger.looks, plain, put, tuple(residuals), tuple(unknown))
 
     return checks.of(Check.LACKING, Lacking, made)
 

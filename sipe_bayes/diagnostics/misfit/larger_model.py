@@ -63,7 +63,7 @@ class LargerModelOptions(Options):
     seen: float = option(
         5.0, "from none, to first order, that the best cause has: else nothing is put in", "sds", above=0
     )
-    told: float = option(3.0, "from none, from which a cause that was put in is there", "sds", above=0)
+    clear: float = option(3.0, "from none, from which a cause that was put in is there", "sds", above=0)
     rival: float = option(0.5, "of what the best cause explains, from which others are put in beside it", above=0)
     most: int = option(6, "that are put in at once", least=1)
     share: float = option(0.8, "of the windows that the plain model follows, that it has to follow", above=0)
@@ -333,7 +333,7 @@ def _there(larger: _Larger, logs: ProbedLogs, own: GaussianMixture, options: Lar
         sizes = [parameter.default is not None for parameter in one.parameters]  # of others the plain model has none
         away = np.where(sizes, np.abs(logs.theta[mine] - one.plain) / sd[mine], 0.0)
         k = int(away.argmax())
-        if away[k] < options.told:
+        if away[k] < options.clear:
             continue
         parameter, theta = one.parameters[k], float(logs.theta[mine[k]])
         value, low, high = (float(parameter.value(x)) for x in (theta, theta - sd[mine[k]], theta + sd[mine[k]]))

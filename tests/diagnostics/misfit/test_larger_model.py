@@ -69,7 +69,7 @@ def test_missing_friction_is_put_in_and_theta_is_where_it_should_be(wrong: Asked
     assert friction.cause == "dry friction at ram"
     assert "joint:ram.frictionloss" in friction.remedy
     assert friction.unit == "N"
-    assert 0 < friction.sd < 0.1 * 1.0
+    assert 0 < friction.sd < 0.1
     assert abs(friction.value - FRICTION) < 4 * friction.sd
     low, high = larger.further.quantile([0.002, 0.998]).numpy()
     assert ((low < TRUTH) & (high > TRUTH)).all()
@@ -89,7 +89,7 @@ def test_what_leaves_more_than_noise_or_is_not_told_is_not_put_in(
 ) -> None:
     """Both ways beside the test above."""
     assert wrong.larger(agree=0.5) is None
-    assert wrong.larger(told=1e3) is None
+    assert wrong.larger(clear=1e3) is None
 
     def never(*_: object) -> None:
         raise AssertionError("put in")
