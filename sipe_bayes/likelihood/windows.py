@@ -8,8 +8,9 @@ would dominate them; short windows with measured starts give away the noise of t
 Residuals are white or first-order autoregressive, across windows too (``sipe_bayes.likelihood.noise``). That of an
 orientation is the rotation vector from the predicted to the measured one, three numbers of one noise scale.
 
-A start is the tangent of the state at a reference: (dq (nv), dv (nv), dact (na)), with a weak normal prior, far wider
-than any measurement (``Environment.start_sd``), so that what is never measured does not make the equations singular.
+A start is the tangent (dq (nv), dv (nv), dact (na)) of the state at the one that the log measures, seen through the
+sensors of theta (``starts.measured``). Its normal prior is as wide as that measurement is uncertain, and far wider where
+nothing measures it (``Environment.start_sd``), so that the equations are not singular.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ from sipe_bayes.likelihood.starts.estimates import (
 )
 from sipe_bayes.likelihood.starts.filters import FilterStarts
 from sipe_bayes.likelihood.starts.history import past_commands, with_history
-from sipe_bayes.simulation.contacts import Contacts
+from sipe_bayes.likelihood.starts.measured import MeasuredStarts, measurement_sd
+from sipe_bayes.simulation.contacts import Contacts, may_touch
+from sipe_bayes.simulation.prompt import prompt
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import moved
 
@@ -144,7 +147,9 @@ class Windows:
         self.number = np.arange(len(self.log))
         self.filters = FilterStarts(simulator, trajectories, self.reference, self.log, self.start, recorded)
         free = start_sd(simulator, trajectories) if self.settings.starts == "estimated" else np.zeros(0)
-        self.num_start, self.start_precision = len(free), free**-2.0
+        known = measurement_sd(simulator, trajectories)[: len(free)]
+        self.num_start, self.start_precision = len(free), np.minimum(free, np.maximum(known, 1e-9)) ** -2.0
+        self.sensors = MeasuredStarts(simulator, trajectories, self.filters.numbers)
 
     @cached_property
     def contacts(self) -> Contacts:
@@ -264,7 +269,9 @@ class Windows:
         """Starting states (B, W, S) of starts (B, W, D) under theta (B, N)."""
         if not self.num_start:
             return np.broadcast_to(self.reference, (*starts.shape[:-1], self.reference.shape[-1])).copy()
-        return self.filters.put(moved(self.simulator.model, self.reference, starts), theta, starts, self.number)
+        offsets = self.sensors.offsets(theta, self.log, self.start, self.reference)
+        begin = moved(self.simulator.model, self.reference, starts if offsets is None else starts + offsets)
+        return self.filters.put(begin, theta, starts, self.number)
 
     def predict(self, theta: FloatArray, starts: FloatArray, in_float64: bool = False) -> tuple[FloatArray, BoolArray]:
         """Simulate every window.
@@ -288,8 +295,7 @@ class Windows:
         actions = np.tile(self.actions, (batch, 1, 1))
         goals = None if self.goals is None else np.tile(self.goals, (batch, 1))
         dt, names = np.tile(self.dt, batch), self.names * batch
-        simulator = self.simulator.on_processor if in_float64 else self.simulator
-        result = simulator.rollout(thetas, actions, states, dt, names, goals=goals)
+        result = self._simulators[in_float64].rollout(thetas, actions, states, dt, names, goals=goals)
         shape = (batch, self.num_windows)
         good = result.valid.reshape(*shape, -1)
         predicted = result.observations.reshape(*shape, *result.observations.shape[1:])[..., self.channels]
@@ -297,6 +303,12 @@ class Windows:
         predicted = written_near(predicted, self.measured, self.rotations)
         needed = self.owned | self.compared.any(-1)
         return predicted, np.asarray((good | ~needed).all(axis=(1, 2)))
+
+    @cached_property
+    def _simulators(self) -> tuple[Simulator, Simulator]:
+        """What simulates the windows, and the same in float64 on the processor."""
+        contacts = may_touch(self.simulator.model) and self.contacts.touch
+        return prompt(self.simulator, contacts), prompt(self.simulator.on_processor, contacts)
 
     def spend(self, batch: int) -> None:
         """Count the rollouts of ``batch`` thetas; raises BudgetExhausted where there are too few left."""

@@ -104,10 +104,14 @@ class Engine:
                 return Motion(states, derived, clean & valid)
             return self._stepwise(run) if self.environment.stepwise else self._open_loop(run)
 
+    def inputs(self, run: Run) -> tuple[FloatArray, FloatArray]:
+        """Starts (B, S), and controls (B, P, U) of all physics steps."""
+        return run.start, np.repeat(self.environment.control(self.model, run.start, run.actions), run.skip, axis=1)
+
     def _open_loop(self, run: Run) -> Motion:
-        skip, models, timesteps, actions, start = run
+        skip, models, timesteps, actions, _ = run
         environment, horizon = self.environment, actions.shape[1]
-        controls = np.repeat(environment.control(self.model, start, actions), skip, axis=1)
+        start, controls = self.inputs(run)
         # A reset sets the time to 0, so a first step from time 0 that fails ends on time: only the next one
         # shows it. Sensordata belongs to the state before the step, so the last sample's comes with the next
         # step as well.

@@ -128,8 +128,7 @@ class Simulator(Simulated):
                 given = Batch(self.pool, slots, skip, timesteps[chunk], actions[chunk], initial_state[chunk])
                 self._run(motion, chunk, given, targets)
         valid = np.logical_and.accumulate(motion.valid, axis=1)
-        self.diverged += int((~valid[:, -1]).sum())
-        self.control_steps += batch * horizon
+        self.count(batch * horizon, int((~valid[:, -1]).sum()))
         length = np.full(batch, horizon)
         rewards = self.environment.rewards(motion.states, motion.derived, actions, goals)
         rewards = None if rewards is None else np.where(valid[:, 1:], rewards, 0.0)
@@ -143,6 +142,16 @@ class Simulator(Simulated):
             )
             self.audit.compare(made, again, exact)
         return made
+
+    @property
+    def recorded_size(self) -> int:
+        """Numbers of the states that a rollout returns."""
+        return self.state_size
+
+    def count(self, steps: int, diverged: int) -> None:
+        """Count control steps and diverged simulations."""
+        self.control_steps += steps
+        self.diverged += diverged
 
     def replay(self, theta: FloatArray, trajectories: Trajectories, starts: FloatArray | None = None) -> Trajectories:
         """The recorded actions from the recorded starting states, for every theta.
@@ -311,7 +320,7 @@ class _Recorded:
         shape = (batch, horizon + 1)
         derived = np.full((*shape, simulator.engine.derived_size), np.nan) if environment.needs_derived else None
         return cls(
-            np.full((*shape, simulator.state_size), np.nan),
+            np.full((*shape, simulator.recorded_size), np.nan),
             np.full((*shape, len(environment.channels)), np.nan),
             np.zeros(shape, bool),
             derived,

@@ -18,6 +18,7 @@ from sipe_bayes.inference import importance
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.importance import Draws, Judgement
 from sipe_bayes.inference.laplace.options import LaplaceOptions
+from sipe_bayes.inference.laplace.solver import SegmentSolver, SolverState, fits_segments
 from sipe_bayes.inference.laplace.state_space.chain_draws import blur, draws_size, looked_beyond
 from sipe_bayes.inference.laplace.state_space.known_starts import KnownStartSearch, KnownStartState
 from sipe_bayes.inference.laplace.state_space.noise import excess
@@ -56,7 +57,7 @@ class LaplaceState:
         done: whether all have ended.
     """
 
-    search: WindowState | StateSpaceState | KnownStartState
+    search: SolverState | WindowState | StateSpaceState | KnownStartState
     draws: Draws | None = None
     given: int = 0
     judgements: tuple[Judgement, ...] = ()
@@ -176,6 +177,8 @@ class Laplace(Estimator[LaplaceState]):
     def _strategy(self, windows: Windows | Chain) -> Strategy[Any]:
         """The search that fits the likelihood."""
         if not isinstance(windows, Chain):
+            if fits_segments(windows):
+                return SegmentSolver(self.problem, windows)
             return WindowSearch(self.problem, windows)
         known = windows.settings.starts == "recorded"
         return KnownStartSearch(self.problem, windows) if known else StateSpaceSearch(self.problem, windows)
@@ -191,6 +194,8 @@ class Laplace(Estimator[LaplaceState]):
             stands = not state.judgements or state.judgements[0].normal
             return self._looked_beyond(windows, state, target) if stands or not shots_left else state
         assert isinstance(state.search, WindowState)
+        if isinstance(state.search, SolverState):
+            return replace(state, done=True)
         if not (search := led_on(self.problem, windows, state.search)).done:
             return replace(state, search=search)
         kept = distinct(search.optima)

@@ -10,9 +10,16 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.rotations import added, between
 
 
-def smoothed(series: FloatArray, dt: float, derivative: int = 0) -> FloatArray:
-    """Local quadratics over 60 ms, at least 5 samples, of a series (T+1, ...); derivative 1: their slopes in time."""
-    span = _span(len(series), dt)
+def smoothed(series: FloatArray, dt: float, derivative: int = 0, wider: int = 1) -> FloatArray:
+    """Local quadratics over 60 ms, at least 5 samples, of a series (T+1, ...).
+
+    Args:
+        series: the samples.
+        dt: seconds between them.
+        derivative: 1 for their slopes in time.
+        wider: how many times as many samples.
+    """
+    span = _span(len(series), dt, wider)
     if span < 3:
         return np.gradient(series, dt, axis=0) if derivative else series
     weights, columns, half = _weights(span, derivative), series.reshape(len(series), -1), span // 2
@@ -28,9 +35,10 @@ def left_by_smoothing(count: int, dt: float) -> float:
     return 0.0 if span < 5 else float(1 - _weights(span, 0)[span // 2, span // 2])
 
 
-def _span(count: int, dt: float) -> int:
+def _span(count: int, dt: float, wider: int = 1) -> int:
     """Samples of a local quadratic, an odd number."""
-    return min(max(5, 2 * round(0.06 / dt / 2) + 1), count - (count + 1) % 2)
+    half = wider * (max(5, 2 * round(0.06 / dt / 2) + 1) // 2)
+    return min(2 * half + 1, count - (count + 1) % 2)
 
 
 @functools.lru_cache(maxsize=64)

@@ -1,0 +1,603 @@
+r"""The fit of smooth segments: first plain least squares of theta, then theta, initial states and noise together.
+
+**Unknowns**: theta (N,) in the unit cube, and the initial state of each segment as its tangent x_w (D,) from the one
+that the log measures, with a prior as wide as that measurement is uncertain. **Energy** for a noise:
+
+.. math:: E = \tfrac12 r^\top V^{-1} r + \tfrac12 \sum_w x_w^\top P_x x_w + \tfrac12 (\theta-\mu)^\top P (\theta-\mu)
+
+**Phases**, one step of each is a linearisation and a batch of damped steps (Levenberg, Marquardt):
+
+1. PLAIN: theta alone, the segments begin as measured, white noise of the residuals' present size. On a part of the
+   segments first, then on as many as ``linearised_steps`` allows. Its end is the plain fit, the first answer.
+2. FIT: theta and the initial states, noise by restricted likelihood before each step; on the same part, then on all
+   segments up to ``fitted_steps``. Columns of the initial states are kept while they predict what a step gains.
+3. COMPARE: the plain fit and the posterior mode each run free along the whole training logs. Where the mode is worse by
+   more than ``worse``, coloured noise has taken over what parameters explain. Then the estimate is that of white
+   noise, fitted again from the plain fit, and the interval is the sandwich (``likelihood.noise_spread``), which holds
+   for coloured residuals.
+
+**Differences** are as long as ``share`` of the conditional posterior sd of what they move, so that slopes are those of
+the posterior's width, whatever dry friction or a delay does below it.
+
+**More starting points** are followed only where the fit is poor: residuals larger than ``poor`` times what samples
+scatter by. They are the best of a few draws from the prior, fitted as in 1; the best end is kept.
+
+A. Bock's multiple shooting (1981, https://doi.org/10.1007/978-3-642-67917-5_8) with initial states eliminated
+(``likelihood.block_tridiagonal``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import StrEnum, auto
+
+import numpy as np
+import torch
+from scipy.stats import chi2
+
+from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.findings import Code, finding
+from sipe_bayes.inference.laplace.strategy import SearchProblem
+from sipe_bayes.inference.laplace.windows.contact_starts import begins_in_contact
+from sipe_bayes.inference.laplace.windows.energy import WindowEnergy, misfit, present_noise, same_noise, updated_noise
+from sipe_bayes.inference.laplace.windows.growing_windows import counted, grows, lent, level
+from sipe_bayes.inference.laplace.windows.optimum import Ending, summarised
+from sipe_bayes.inference.laplace.windows.state import WindowOptimum, WindowState
+from sipe_bayes.likelihood.minimise import damped_box_step
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.noise_spread import sandwich
+from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION
+from sipe_bayes.likelihood.restricted import eliminate_starts
+from sipe_bayes.likelihood.settings import BudgetExhausted
+from sipe_bayes.likelihood.wild_samples import wild_residuals
+from sipe_bayes.likelihood.windows import Linearisation, Windows
+
+_DAMPINGS = np.array([0.03, 1.0, 30.0, 1000.0])  # tried together, times the damping of the step before
+_EASY = 1e-2  # damping below which the first two are enough
+_LONGEST = 0.3  # of the cube: the longest step of a parameter
+
+
+class Stage(StrEnum):
+    """What the next step does."""
+
+    PLAIN = auto()
+    FIT = auto()
+    COMPARE = auto()
+
+
+@dataclass(frozen=True)
+class Here:
+    """Where a fit stands.
+
+    Args:
+        stage: what the next step does.
+        part: which part of the segments is simulated: 0 the smallest.
+        theta: (N,).
+        starts: (W, D), of all segments.
+        noise: as last estimated.
+        damping: of the next step.
+        iteration: steps until now.
+        scale: (N + D,), lengths of the finite differences.
+        residual: (K, L, C), of the part's K segments; None where they are to be simulated.
+        starts_jacobian: (K, L, C, D), kept; None where it is to be taken anew.
+        misfit: of the first residuals, in units of the channels' spread.
+        gained: nats, of the step before.
+        white: whether the noise is white, as the configuration or the comparison asks.
+    """
+
+    stage: Stage
+    part: int
+    theta: FloatArray
+    starts: FloatArray
+    noise: Noise
+    damping: float
+    iteration: int = 0
+    scale: FloatArray = field(default_factory=lambda: np.zeros(0))
+    residual: FloatArray | None = None
+    starts_jacobian: FloatArray | None = None
+    misfit: float = 0.0
+    gained: float = np.inf
+    white: bool = False
+
+
+@dataclass(frozen=True)
+class SolverState(WindowState):
+    """A fit of segments.
+
+    Args:
+        plain: (N,), the plain fit from the first starting point; empty before it.
+        compared: whether coloured noise has been held against plain least squares.
+        freed: whether the mode's free-run error has been compared with the plain fit's.
+        wider: by how much coloured residuals make the variance of plain least squares larger than white ones would.
+        behind: how many times the plain fit's that error was; 0 where it was not larger.
+    """
+
+    here: Here  # type: ignore[assignment]
+    plain: FloatArray = field(default_factory=lambda: np.zeros(0))
+    compared: bool = False
+    freed: bool = False
+    wider: float = 1.0
+    behind: float = 0.0
+
+    @property
+    def stage_begins(self) -> bool:
+        """Whether the noise model is still to be held against plain least squares."""
+        return not self.compared and not self.here.white and len(self.plain) > 0
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """The best of a batch of damped steps.
+
+    Args:
+        theta: (N,).
+        starts: (K, D).
+        residual: (K, L, C).
+        gained: nats; not above zero where no step lowered the energy.
+        expected: nats that the linearisation promised for the least damped step.
+        damping: of the best.
+    """
+
+    theta: FloatArray
+    starts: FloatArray
+    residual: FloatArray
+    gained: float
+    expected: float
+    damping: float
+
+
+class SegmentSolver:
+    """The ``Strategy`` for segments that no impact interrupts."""
+
+    def __init__(self, problem: SearchProblem, windows: Windows) -> None:
+        self.problem, self.windows = problem, windows
+        self.tuning, self.prior = problem.options.tuning.solver, problem.quadratic_prior
+        self._views: dict[int, tuple[IntArray, Windows]] = {}
+
+    @property
+    def step_rollouts(self) -> int:
+        """Rollouts that a step takes at most."""
+        windows = self.windows
+        return (windows.num_theta + windows.num_start + len(_DAMPINGS) + 1) * len(windows.trajectories)
+
+    def start(self) -> SolverState:
+        """The first state: at the model as given, or at the starting point that the options name."""
+        initial = self.problem.options.initial
+        points = np.clip(self.problem.space.default_theta, 0, 1)[None] if initial is None else initial[:1]
+        theta, valid = self._screened(points, 0 if initial is not None else self.problem.options.candidates)
+        if not valid:
+            self.problem.find(finding(Code.DIVERGES_AS_GIVEN))
+        return SolverState(theta[None], 0, self._begin(theta))
+
+    def step(self, state: SolverState) -> SolverState:
+        """One linearisation and the best of a batch of steps; or the comparison at the end."""
+        self.windows.mask(state.wild)
+        self._views = {}
+        stages = {Stage.PLAIN: self._plain, Stage.FIT: self._fit, Stage.COMPARE: self._compare}
+        return stages[state.here.stage](state)
+
+    def _begin(self, theta: FloatArray) -> Here:
+        windows = self.windows
+        fixed = windows.fixed_sd
+        sd = np.where(np.isnan(fixed), np.maximum(0.1 * windows.spread, windows.rounding), fixed)
+        stage = Stage.PLAIN if windows.starts_measured else Stage.FIT
+        noise = Noise(sd, np.zeros(len(sd)))
+        white = windows.settings.noise != "ar1"
+        return Here(stage, 0, theta, windows.no_starts(), noise, self.tuning.damping, white=white)
+
+    # Parts of the segments
+
+    def _share(self, part: int) -> float:
+        """Of the segments that a part holds."""
+        windows = self.windows
+        skip = np.ones(windows.num_windows)
+        if windows.num_start:
+            skip = np.array([windows.simulator.physics_steps(float(dt))[0] for dt in windows.dt])
+        columns = windows.num_theta + windows.num_start + 1
+        most = self.tuning.linearised_steps / columns * (0.25, 1.0, self.tuning.whole)[part]
+        return float(most / (windows.steps * skip).sum())
+
+    def _view(self, part: int) -> tuple[IntArray, Windows]:
+        """Numbers (K,) of the segments of a part, and these."""
+        if part not in self._views:
+            share, windows = self._share(part), self.windows
+            if share >= 1:
+                self._views[part] = np.arange(windows.num_windows), windows
+            else:
+                keep = spread_segments(windows.log, share)
+                self._views[part] = keep, windows.part(keep)
+        return self._views[part]
+
+    def _last(self, stage: Stage) -> int:
+        """The largest part that a stage simulates."""
+        return 1 if stage is Stage.PLAIN else 2
+
+    def _next_part(self, stage: Stage, part: int) -> int | None:
+        """The next part with more segments; None where there is none."""
+        size = len(self._view(part)[0])
+        for other in range(part + 1, self._last(stage) + 1):
+            if len(self._view(other)[0]) > size:
+                return other
+        return None
+
+    # Steps
+
+    def _screened(self, points: FloatArray, draws: int) -> tuple[FloatArray, bool]:
+        """The first point if its simulation is valid, else the best of draws from the prior; and whether it was."""
+        keep, view = self._view(0)
+        before = lent(self.windows, view)
+        try:
+            valid = bool(view.residuals(points, np.tile(view.no_starts(), (1, 1, 1)))[1][0])
+            if valid or not draws:
+                return points[0], valid
+            generator = torch.Generator().manual_seed(self.problem.seed)
+            drawn = self.problem.prior.sample((draws,), generator=generator).numpy()
+            return self._best(view, drawn), False
+        finally:
+            counted(self.windows, view, before)
+
+    def _best(self, view: Windows, thetas: FloatArray) -> FloatArray:
+        """That of thetas (B, N) whose plain residuals are least."""
+        residual, valid = view.residuals(thetas, np.tile(view.no_starts(), (len(thetas), 1, 1)))
+        loss = np.array([self._profile(view, r) if ok else np.inf for r, ok in zip(residual, valid, strict=True)])
+        if not np.isfinite(loss).any():
+            raise ValueError(
+                f"every one of {len(thetas)} starting points diverges in the simulation; narrow the bounds, "
+                "shorten the model's timestep or the window"
+            )
+        return np.asarray(thetas[int(loss.argmin())])
+
+    def _profile(self, view: Windows, residual: FloatArray) -> float:
+        """Energy of a residual (K, L, C) with white noise of its own size."""
+        noise, counts = present_noise(view, residual), view.observed.sum((0, 1))
+        free = np.isnan(view.fixed_sd)
+        square = (residual**2).sum((0, 1)) / noise.sd**2
+        return float((counts * np.log(noise.sd))[free].sum() + 0.5 * square[~free].sum())
+
+    def _lengths(self, view: Windows, here: Here) -> FloatArray:
+        """Lengths (N + D,) of the finite differences."""
+        n, scale = view.num_theta, here.scale
+        if not len(scale):
+            known = self.tuning.share / np.sqrt(np.maximum(view.start_precision, 1e-12))
+            scale = np.concatenate([np.full(n, self.tuning.first_length), np.clip(known, 1e-6, 1e-3)])
+        return np.concatenate([np.maximum(scale[:n], view.least_steps(here.theta)), scale[n:]])
+
+    def _scaled(self, view: Windows, precision: FloatArray, starts: FloatArray | None) -> FloatArray:
+        """Lengths (N + D,) for the next differences, of the diagonals of precisions (N, N) and (D,)."""
+        tuning, n = self.tuning, len(precision)
+        of_theta = tuning.share / np.sqrt(np.maximum(np.diag(precision), 1e-12))
+        of_theta = np.clip(of_theta, tuning.shortest, tuning.longest)
+        if starts is None:
+            starts = view.start_precision
+        return np.concatenate([of_theta, np.clip(tuning.share / np.sqrt(np.maximum(starts, 1e-12)), 1e-7, 1e-2)])[
+            : n + view.num_start
+        ]
+
+    def _plain(self, state: SolverState) -> SolverState:
+        here, (keep, view) = state.here, self._view(state.here.part)
+        n, starts, before = view.num_theta, view.no_starts(), lent(self.windows, view)
+        try:
+            scale = self._lengths(view, here)
+            lin = view.linearise(here.theta, starts, with_starts=False, residual=here.residual, theta_step=scale[:n])
+            noise = present_noise(view, lin.residual)
+            rows = (lin.jacobian / noise.sd[:, None]).reshape(-1, n)
+            precision, pull = rows.T @ rows, rows.T @ (lin.residual / noise.sd).ravel()
+            pull = pull + self.prior.pull(here.theta)
+            hessian = precision + self.prior.precision + FLAT_PRECISION * np.eye(n)
+            energy = self._profile(view, lin.residual) + self.prior.energy(here.theta)
+            thetas = np.stack([self._moved(hessian, pull, here.theta, d) for d in self._dampings(here)])
+            residuals, valid = view.residuals(thetas, np.tile(starts, (len(thetas), 1, 1)))
+        finally:
+            counted(self.windows, view, before)
+        energies = np.array(
+            [
+                self._profile(view, r) + self.prior.energy(theta) if ok else np.inf
+                for theta, r, ok in zip(thetas, residuals, valid, strict=True)
+            ]
+        )
+        best, after = int(energies.argmin()), replace(here, iteration=here.iteration + 1)
+        gained, damping = energy - float(energies[best]), float(here.damping * _DAMPINGS[best])
+        after = replace(after, scale=self._scaled(view, precision, None), noise=noise)
+        after = replace(after, misfit=here.misfit or misfit(view, lin.residual))
+        if gained > 0:
+            after = replace(after, theta=thetas[best], residual=residuals[best], damping=self._damped(damping))
+        else:
+            after = replace(after, residual=lin.residual, damping=self._damped(damping * _DAMPINGS[-1]))
+        enough = self.tuning.plain_gain * (10.0 if here.part == 0 and self._next_part(Stage.PLAIN, 0) else 1.0)
+        stuck = gained <= 0 and here.damping >= 1.0
+        if (gained > enough or (gained <= 0 and not stuck)) and after.iteration < self.tuning.most_steps:
+            return replace(state, here=after)
+        part = self._next_part(Stage.PLAIN, here.part)
+        if part is not None and after.iteration < self.tuning.most_steps:
+            return replace(state, here=replace(after, part=part, residual=None))
+        return self._plain_ended(state, after, view)
+
+    def _plain_ended(self, state: SolverState, here: Here, view: Windows) -> SolverState:
+        """From the plain fit on theta, initial states and noise are fitted together."""
+        if not len(state.plain):
+            state = replace(state, plain=here.theta)
+            self.problem.tell("first estimate", self.windows.rollouts)
+        if here.residual is not None and not state.optima and len(wild := wild_residuals(view, here.residual)):
+            state = replace(state, wild=np.concatenate([state.wild, wild]))
+            here = replace(here, residual=None)
+        return replace(state, here=replace(here, stage=Stage.FIT, damping=self.tuning.damping, starts_jacobian=None))
+
+    def _moved(self, hessian: FloatArray, pull: FloatArray, theta: FloatArray, damping: float) -> FloatArray:
+        """Where a damped step from theta (N,) leads (N,)."""
+        move = damped_box_step(hessian, pull, theta, damping)
+        return np.clip(theta + np.clip(move, -_LONGEST, _LONGEST), 0.0, 1.0)
+
+    def _dampings(self, here: Here) -> FloatArray:
+        """Those that are tried."""
+        return np.asarray(here.damping * (_DAMPINGS if here.damping > _EASY else _DAMPINGS[:2]))
+
+    def _damped(self, damping: float) -> float:
+        return float(np.clip(damping, 1e-7, 1e4))
+
+    def _fit(self, state: SolverState) -> SolverState:
+        here, (keep, view) = state.here, self._view(state.here.part)
+        before = lent(self.windows, view)
+        try:
+            lin, fresh, scale = self._linearised(view, here, here.starts[keep])
+            if not lin.valid:  # on more segments than before: from the initial states that were measured
+                here = replace(here, starts=self.windows.no_starts(), residual=None)
+                lin, fresh, scale = self._linearised(view, replace(here, starts_jacobian=None), here.starts[keep])
+            if state.stage_begins:
+                takes_over, wider = self._noise_takes_over(view, here, lin)
+                here = replace(here, white=takes_over)
+                state = replace(state, compared=True, wider=wider if takes_over else 1.0)
+            moments = view.moments(lin, white=here.white)
+            noise = here.noise
+            if here.iteration == 0 or here.stage is Stage.FIT and not here.noise.tau.any():
+                noise = present_noise(view, lin.residual)
+            noise = updated_noise(
+                view, moments, noise, here.theta, here.starts[keep], self.prior, not here.white, held=False
+            )
+            tolerance = self.tuning.tolerance * max(view.num_theta, 1) * state.wider
+            trial, hessian = self._tried(view, here, lin, moments, noise, here.starts[keep], tolerance)
+        finally:
+            counted(self.windows, view, before)
+        after = replace(
+            here,
+            iteration=here.iteration + 1,
+            noise=noise,
+            gained=trial.gained,
+            scale=scale if hessian is None else hessian,
+            misfit=here.misfit or misfit(view, lin.residual),
+        )
+        import os
+        if os.environ.get('DBG'): print('   FIT expected %.3f gained %.3f damp %.1e fresh %s' % (trial.expected, trial.gained, trial.damping, fresh))
+        small = trial.expected < tolerance or (trial.gained < tolerance and here.damping <= 1.0)
+        settled = small and same_noise(noise, here.noise)
+        stuck = trial.gained <= 0 and here.damping >= 1e3
+        last = after.iteration >= self.tuning.most_steps or self._leaves_no_room()
+        near = settled and here.gained < view.num_theta * state.wider
+        if (settled or stuck) and not (fresh or near or last):
+            return replace(state, here=replace(after, starts_jacobian=None))
+        if settled or stuck or last:
+            part = None if last else self._next_part(Stage.FIT, here.part)
+            if part is not None:
+                return replace(state, here=replace(after, part=part, residual=None, starts_jacobian=None))
+            return self._ended(state, after, lin, moments, keep, view, settled or stuck)
+        foretold = trial.gained > 0.75 * trial.expected
+        kept = lin.jacobian[..., view.num_theta :] if foretold and view.num_start else None
+        after = replace(after, starts_jacobian=None if kept is None else np.ascontiguousarray(kept))
+        if trial.gained <= 0:
+            return replace(
+                state, here=replace(after, residual=lin.residual, damping=self._damped(here.damping * _DAMPINGS[-1]))
+            )
+        starts = here.starts.copy()
+        starts[keep] = trial.starts
+        after = replace(after, theta=trial.theta, starts=starts, residual=trial.residual)
+        return replace(state, here=replace(after, damping=self._damped(trial.damping)))
+
+    def _noise_takes_over(self, view: Windows, here: Here, lin: Linearisation) -> tuple[bool, float]:
+        """Whether coloured noise would move theta farther from plain least squares than coloured noise itself could.
+
+        Hausman's specification test (J. Hausman 1978, "Specification Tests in Econometrics", Econometrica 46): if the
+        noise is coloured and the model right, the steps of plain and of generalised least squares differ by no more than
+        the sandwich covariance of the plain one.
+        """
+        white, starts = present_noise(view, lin.residual), here.starts[self._view(here.part)[0]]
+        n, pull = view.num_theta, -view.start_precision * starts
+        prior = self.prior.precision + FLAT_PRECISION * np.eye(n)
+        coloured = view.moments(lin)
+        noise = updated_noise(view, coloured, white, here.theta, starts, self.prior, coloured=True, held=False)
+        steps, spread, plain = [], np.eye(n), np.eye(n)
+        for moments, own in ((view.moments(lin, white=True), white), (coloured, noise)):
+            solved = eliminate_starts(moments.normal(own), n, view.start_precision, pull)
+            inverse = np.linalg.inv(solved.precision + prior)
+            steps.append(inverse @ (solved.gradient + self.prior.pull(here.theta)))
+            if own is white:
+                middle = sandwich(lin.jacobian, solved.slope, white.sd, view.sequences, noise)
+                spread, plain = inverse @ (middle + prior) @ inverse, inverse
+        apart = steps[1] - steps[0]
+        import os
+
+        if os.environ.get("DBG"):
+            print("HAUSMAN", apart @ np.linalg.solve(spread, apart), n, "tau", noise.tau)
+        wider = float(np.exp(np.log(np.diag(spread) / np.diag(plain)).mean()))
+        return bool(chi2.sf(apart @ np.linalg.solve(spread, apart), n) < self.tuning.takes_over), max(wider, 1.0)
+
+    def _linearised(self, view: Windows, here: Here, starts: FloatArray) -> tuple[Linearisation, bool, FloatArray]:
+        """Linearisation of a part, whether all of it is new, and the lengths of its differences."""
+        scale, n = self._lengths(view, here), view.num_theta
+        if here.starts_jacobian is not None:
+            lin = view.linearise(here.theta, starts, True, False, here.residual, scale[:n])
+            both = np.concatenate([lin.jacobian, here.starts_jacobian * view.observed[..., None]], axis=-1)
+            return replace(lin, jacobian=both), False, scale
+        lin = view.linearise(here.theta, starts, True, True, here.residual, scale[:n], scale[n:])
+        return lin, True, scale
+
+    def _tried(
+        self,
+        view: Windows,
+        here: Here,
+        lin: Linearisation,
+        moments: object,
+        noise: Noise,
+        starts: FloatArray,
+        tolerance: float,
+    ) -> tuple[_Trial, FloatArray | None]:
+        """The best of a batch of damped steps of theta and the initial states, and lengths of the next differences."""
+        energy, n = WindowEnergy(view, noise, self.prior), view.num_theta
+        normal = moments.normal(noise)  # type: ignore[attr-defined]
+        now = energy(here.theta, starts, lin.residual)
+        pull, thetas, changes, expected = -view.start_precision * starts, [], [], 0.0
+        scale = None
+        for k, damping in enumerate(self._dampings(here)):
+            solved = eliminate_starts(normal, n, view.start_precision, pull, float(damping))
+            hessian = solved.precision + self.prior.precision + FLAT_PRECISION * np.eye(n)
+            gradient = solved.gradient + self.prior.pull(here.theta)
+            theta = self._moved(hessian, gradient, here.theta, float(damping))
+            move = theta - here.theta
+            if k == 0:
+                expected = float(gradient @ move - 0.5 * move @ hessian @ move) + 0.5 * solved.explained
+                own = normal[:, n : n + view.num_start, n : n + view.num_start]
+                diagonal = np.median(np.diagonal(own, axis1=1, axis2=2), axis=0) if view.num_start else np.zeros(0)
+                scale = self._scaled(view, solved.precision, view.start_precision + diagonal)
+                if expected < tolerance:
+                    return _Trial(here.theta, starts, lin.residual, 0.0, expected, here.damping), scale
+            thetas.append(theta)
+            changes.append(solved.blocks(move))
+        stacked, all_starts = np.stack(thetas), starts + np.stack(changes)
+        residuals, valid = view.residuals(stacked, all_starts)
+        energies = np.array(
+            [
+                energy(t, s, r) if ok else np.inf
+                for t, s, r, ok in zip(stacked, all_starts, residuals, valid, strict=True)
+            ]
+        )
+        best = int(energies.argmin())
+        damping = float(here.damping * _DAMPINGS[best])
+        gained = now - float(energies[best])
+        return _Trial(stacked[best], all_starts[best], residuals[best], gained, expected, damping), scale
+
+    def _leaves_no_room(self) -> bool:
+        """Whether the budget leaves no room for another step."""
+        windows = self.windows
+        return not windows.has_room(windows.num_theta + windows.num_start + len(_DAMPINGS) + 1)
+
+    # The end
+
+    def _ended(
+        self,
+        state: SolverState,
+        here: Here,
+        lin: Linearisation,
+        moments: object,
+        keep: IntArray,
+        view: Windows,
+        settled: bool,
+    ) -> SolverState:
+        """Record the optimum; then compare it with the plain fit, or go on from further starting points."""
+        if here.white and self.windows.settings.noise != "white":
+            view = view.part(np.arange(view.num_windows))
+            view.settings = replace(view.settings, noise="sandwich")
+        ending = Ending(
+            here.theta,
+            here.starts[keep],
+            here.noise,
+            moments,  # type: ignore[arg-type]
+            lin.residual,
+            lin.jacobian,
+            state.points[state.point],
+            here.iteration,
+            here.misfit,
+            0.0,
+            False,
+            settled,
+            not settled and self._leaves_no_room(),
+            None,
+        )
+        optimum = summarised(self.problem, view, ending)
+        slope = np.zeros((self.windows.num_windows, self.windows.num_start, view.num_theta))
+        slope[keep] = optimum.slope
+        reason = None
+        if ending.cut_short:
+            reason = finding(Code.SEARCH_CUT_SHORT)
+        elif not settled:
+            reason = finding(Code.SEARCH_UNSETTLED, steps=here.iteration)
+        optimum = replace(optimum, starts=here.starts, slope=slope, finding=reason)
+        state = replace(state, optima=(*state.optima, optimum), here=replace(here, residual=None, starts_jacobian=None))
+        if self._is_poor(optimum) and not state.scouted and self.problem.options.restarts > 1:
+            return self._further(state)
+        if state.point + 1 < len(state.points):
+            point = state.point + 1
+            return replace(state, point=point, here=self._begin(state.points[point]))
+        if not here.white and len(state.plain) and not state.freed:
+            return replace(state, here=replace(here, stage=Stage.COMPARE, residual=None, starts_jacobian=None))
+        return replace(state, done=True)
+
+    def _is_poor(self, optimum: WindowOptimum) -> bool:
+        """Whether the residuals are far larger than what samples scatter by, and a good part of what channels do."""
+        windows = self.windows
+        if not windows.num_start:
+            scatter = np.maximum(windows.fixed_sd, windows.rounding)
+            return bool((optimum.sd > self.tuning.poor * np.where(np.isnan(scatter), np.inf, scatter)).any())
+        large = optimum.sd > self.tuning.gross * windows.spread
+        return bool((large & (optimum.sd > self.tuning.poor * level(windows).sd)).any())
+
+    def _further(self, state: SolverState) -> SolverState:
+        """Further starting points: the best of draws from the prior."""
+        keep, view = self._view(0)
+        options = self.problem.options
+        generator = torch.Generator().manual_seed(self.problem.seed + 1)
+        drawn = self.problem.prior.sample((max(options.candidates, 1),), generator=generator).numpy()
+        before = lent(self.windows, view)
+        try:
+            residual, valid = view.residuals(drawn, np.tile(view.no_starts(), (len(drawn), 1, 1)))
+        except BudgetExhausted:
+            return replace(state, scouted=True, done=True)
+        finally:
+            counted(self.windows, view, before)
+        loss = np.array([self._profile(view, r) if ok else np.inf for r, ok in zip(residual, valid, strict=True)])
+        order = np.argsort(loss, kind="stable")[: min(options.restarts - 1, int(np.isfinite(loss).sum()))]
+        points = np.concatenate([state.points, drawn[order]])
+        if not len(order):
+            return replace(state, scouted=True, done=True)
+        return replace(state, points=points, scouted=True, point=state.point + 1, here=self._begin(drawn[order[0]]))
+
+    def _compare(self, state: SolverState) -> SolverState:
+        """Hold the mode's free-run error against the plain fit's."""
+        best = max(state.optima, key=lambda one: one.evidence)
+        ratio = self.free_run_ratio(best.theta, state.plain)
+        state = replace(state, freed=True, behind=ratio if ratio > self.tuning.worse else 0.0)
+        if not state.behind:
+            return replace(state, done=True)
+        self.problem.tell("white noise, from the plain fit", self.windows.rollouts)
+        here = replace(self._begin(state.plain), stage=Stage.FIT, part=1, white=True)
+        return replace(state, optima=(), here=here)
+
+    def free_run_ratio(self, theta: FloatArray, plain: FloatArray) -> float:
+        """How many times the free-run error of ``plain`` (N,) that of theta (N,) is; geometric mean over channels.
+
+        Each training log is one simulation from the measured first state. Where that follows no log, as in chaotic
+        motion, the segments stand in its place.
+        """
+        windows = self.windows
+        settings = replace(windows.settings, window=None, windows=(), noise="white", seconds=None)
+        thetas = np.stack([theta, plain])
+        for view in (Windows(settings, windows.simulator, windows.trajectories), windows):
+            windows.spend(2)
+            residual, valid = view.residuals(thetas, np.tile(view.no_starts(), (2, 1, 1)))
+            sizes = np.stack([present_noise(view, r).sd for r in residual])
+            moving = view.spread > 0
+            if valid.all() and (sizes[1] < self.tuning.follows * view.spread)[moving].all():
+                return float(np.exp(np.log(sizes[0] / sizes[1])[moving & np.isnan(view.fixed_sd)].mean()))
+        return 1.0
+
+
+def spread_segments(log: IntArray, share: float) -> IntArray:
+    """Numbers of the segments that are kept of each log, spread evenly over it: one at least."""
+    kept = []
+    for number in np.unique(log):
+        own = np.flatnonzero(log == number)
+        count = min(len(own), max(1, round(share * len(own))))
+        kept.append(own[((np.arange(count) + 0.5) * len(own) / count).astype(int)])
+    return np.concatenate(kept)
+
+
+def fits_segments(windows: Windows) -> bool:
+    """Whether the segments are fitted by this solver: no impact interrupts them, and no known start lies in contact."""
+    return not grows(windows) and not begins_in_contact(windows)
