@@ -147,8 +147,13 @@ class Windows:
         self.number = np.arange(len(self.log))
         self.filters = FilterStarts(simulator, trajectories, self.reference, self.log, self.start, recorded)
         free = start_sd(simulator, trajectories) if self.settings.starts == "estimated" else np.zeros(0)
-        known = measurement_sd(simulator, trajectories)[: len(free)]
-        self.num_start, self.start_precision = len(free), np.minimum(free, np.maximum(known, 1e-9)) ** -2.0
+        self.num_start, self.start_precision = len(free), free**-2.0
+        known, slopes = (part[: len(free)] for part in measurement_sd(simulator, trajectories))
+        self.measured_precision = np.minimum(free, np.maximum(known, 1e-9)) ** -2.0
+        if self.settings.noise != "ar1":
+            self.start_precision = self.measured_precision
+        elif len(free):  # coloured noise hides in what is measured itself, not in its slopes
+            self.start_precision = np.where(slopes, self.measured_precision, self.start_precision)
         self.sensors = MeasuredStarts(simulator, trajectories, self.filters.numbers)
 
     @cached_property

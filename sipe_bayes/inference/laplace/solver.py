@@ -28,6 +28,7 @@ A. Bock's multiple shooting (1981, https://doi.org/10.1007/978-3-642-67917-5_8) 
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field, replace
 from enum import StrEnum, auto
 
@@ -47,13 +48,13 @@ from sipe_bayes.likelihood.minimise import damped_box_step
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.noise_spread import sandwich
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION
-from sipe_bayes.likelihood.restricted import eliminate_starts
+from sipe_bayes.likelihood.restricted import eliminate_starts, marginal
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.wild_samples import wild_residuals
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 
 _DAMPINGS = np.array([0.03, 1.0, 30.0, 1000.0])  # tried together, times the damping of the step before
-_EASY = 1e-2  # damping below which the first two are enough
+_CHEAP = 8  # columns of a linearisation for each of them: a trial is to cost little beside it
 _LONGEST = 0.3  # of the cube: the longest step of a parameter
 
 
@@ -81,7 +82,7 @@ class Here:
         residual: (K, L, C), of the part's K segments; None where they are to be simulated.
         starts_jacobian: (K, L, C, D), kept; None where it is to be taken anew.
         misfit: of the first residuals, in units of the channels' spread.
-        gained: nats, of the step before.
+        exact: whether the step before gained what was expected, so that its kept columns still hold.
         white: whether the noise is white, as the configuration or the comparison asks.
     """
 
@@ -96,7 +97,7 @@ class Here:
     residual: FloatArray | None = None
     starts_jacobian: FloatArray | None = None
     misfit: float = 0.0
-    gained: float = np.inf
+    exact: bool = False
     white: bool = False
 
 
@@ -211,6 +212,12 @@ class SegmentSolver:
     def _last(self, stage: Stage) -> int:
         """The largest part that a stage simulates."""
         return 1 if stage is Stage.PLAIN else 2
+
+    def _as_measured(self, view: Windows) -> Windows:
+        """Segments whose initial states are known as well as smoothed measurements tell them."""
+        view = copy.copy(view)
+        view.start_precision = view.measured_precision
+        return view
 
     def _next_part(self, stage: Stage, part: int) -> int | None:
         """The next part with more segments; None where there is none."""
@@ -329,13 +336,16 @@ class SegmentSolver:
 
     def _dampings(self, here: Here) -> FloatArray:
         """Those that are tried."""
-        return np.asarray(here.damping * (_DAMPINGS if here.damping > _EASY else _DAMPINGS[:2]))
+        columns = self.windows.num_theta + self.windows.num_start + 1
+        easy = 2 if here.damping <= self.tuning.damping else 3
+        return np.asarray(here.damping * _DAMPINGS[: max(easy, min(columns // _CHEAP, len(_DAMPINGS)))])
 
     def _damped(self, damping: float) -> float:
         return float(np.clip(damping, 1e-7, 1e4))
 
     def _fit(self, state: SolverState) -> SolverState:
         here, (keep, view) = state.here, self._view(state.here.part)
+        view = self._as_measured(view) if here.white else view
         before = lent(self.windows, view)
         try:
             lin, fresh, scale = self._linearised(view, here, here.starts[keep])
@@ -345,6 +355,7 @@ class SegmentSolver:
             if state.stage_begins:
                 takes_over, wider = self._noise_takes_over(view, here, lin)
                 here = replace(here, white=takes_over)
+                view = self._as_measured(view) if takes_over else view
                 state = replace(state, compared=True, wider=wider if takes_over else 1.0)
             moments = view.moments(lin, white=here.white)
             noise = here.noise
@@ -361,7 +372,7 @@ class SegmentSolver:
             here,
             iteration=here.iteration + 1,
             noise=noise,
-            gained=trial.gained,
+            exact=abs(trial.gained - trial.expected) < 0.05 * trial.expected,
             scale=scale if hessian is None else hessian,
             misfit=here.misfit or misfit(view, lin.residual),
         )
@@ -371,7 +382,7 @@ class SegmentSolver:
         settled = small and same_noise(noise, here.noise)
         stuck = trial.gained <= 0 and here.damping >= 1e3
         last = after.iteration >= self.tuning.most_steps or self._leaves_no_room()
-        near = settled and here.gained < view.num_theta * state.wider
+        near = settled and here.exact
         if (settled or stuck) and not (fresh or near or last):
             return replace(state, here=replace(after, starts_jacobian=None))
         if settled or stuck or last:
@@ -572,20 +583,32 @@ class SegmentSolver:
     def free_run_ratio(self, theta: FloatArray, plain: FloatArray) -> float:
         """How many times the free-run error of ``plain`` (N,) that of theta (N,) is; geometric mean over channels.
 
-        Each training log is one simulation from the measured first state. Where that follows no log, as in chaotic
-        motion, the segments stand in its place.
+        Each training log is one simulation from the measured first state; where theta is worse from there, from the one
+        that fits best. Where that follows no log, as in chaotic motion, the segments stand in its place.
         """
         windows = self.windows
         settings = replace(windows.settings, window=None, windows=(), noise="white", seconds=None)
-        thetas = np.stack([theta, plain])
         for view in (Windows(settings, windows.simulator, windows.trajectories), windows):
-            windows.spend(2)
-            residual, valid = view.residuals(thetas, np.tile(view.no_starts(), (2, 1, 1)))
-            sizes = np.stack([present_noise(view, r).sd for r in residual])
-            moving = view.spread > 0
-            if valid.all() and (sizes[1] < self.tuning.follows * view.spread)[moving].all():
-                return float(np.exp(np.log(sizes[0] / sizes[1])[moving & np.isnan(view.fixed_sd)].mean()))
+            starts = np.tile(view.no_starts(), (2, 1, 1))
+            for _ in range(2):
+                windows.spend(2)
+                residual, valid = view.residuals(np.stack([theta, plain]), starts)
+                sizes = np.stack([present_noise(view, r).sd for r in residual])
+                moving = (view.spread > 0) & np.isnan(view.fixed_sd)
+                if not valid.all() or not (sizes[1] < self.tuning.follows * view.spread)[moving].all():
+                    break
+                ratio = float(np.exp(np.log(sizes[0] / sizes[1])[moving].mean()))
+                if ratio <= self.tuning.worse or starts.any():
+                    return ratio
+                starts = np.stack([self._best_starts(view, at) for at in (theta, plain)])
         return 1.0
+
+    def _best_starts(self, view: Windows, theta: FloatArray) -> FloatArray:
+        """Initial states (W, D) that fit best at theta (N,), to first order from the measured ones."""
+        self.windows.spend(view.num_start + 1)
+        lin = view.linearise(theta, view.no_starts(), with_theta=False)
+        moments, noise = view.moments(lin, white=True), present_noise(view, lin.residual)
+        return marginal(moments, noise, view.no_starts(), view.start_precision)[1]
 
 
 def spread_segments(log: IntArray, share: float) -> IntArray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import mujoco
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.sensing import Sensing, delayed
 from sipe_bayes.likelihood.starts.estimates import are_states, estimate_states, velocity_columns
@@ -87,8 +87,10 @@ class MeasuredStarts:
         return self._earlier[key]
 
 
-def measurement_sd(simulator: Simulator, trajectories: Trajectories) -> FloatArray:
-    """Sd (2 nv + na,) with which smoothed measurements tell positions and velocities; infinite where none does.
+def measurement_sd(simulator: Simulator, trajectories: Trajectories) -> tuple[FloatArray, BoolArray]:
+    """Sd (2 nv + na,) with which smoothed measurements tell positions and velocities, and which are slopes of others.
+
+    It is infinite where nothing measures a coordinate.
 
     What local quadratics over twice as many samples differ from the usual ones, root mean square, doubled: that holds
     noise and what smoothing bends, and is safe at the ends of a log, where a quadratic is least sure.
@@ -96,7 +98,8 @@ def measurement_sd(simulator: Simulator, trajectories: Trajectories) -> FloatArr
     model = simulator.model
     states, tangent = simulator.environment.state_columns(model), tangent_columns(model)
     square, count = np.zeros(2 * model.nv + model.na), np.zeros(2 * model.nv + model.na)
-    rates = {position: velocity for position, velocity in velocity_columns(model).items()}
+    slopes = np.zeros(len(count), bool)
+    rates = velocity_columns(model)
     measured = {column: c for c, column in enumerate(states) if column in tangent}
     for log in trajectories if len(measured) else ():
         series = np.stack([_bridged(column) for column in log.observations.T], axis=-1)
@@ -114,8 +117,9 @@ def measurement_sd(simulator: Simulator, trajectories: Trajectories) -> FloatArr
                 rounding = _quantum(series[:, channel]) / np.sqrt(12) / (log.dt if derivative else 1.0)
                 square[coordinate] += float(((usual - wide) ** 2).sum()) + len(series) * (0.25 * rounding) ** 2
                 count[coordinate] += len(series)
+                slopes[coordinate] = derivative == 1
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(count > 0, 2 * np.sqrt(square / count), np.inf)
+        return np.where(count > 0, 2 * np.sqrt(square / count), np.inf), slopes
 
 
 def _quantum(series: FloatArray) -> float:
