@@ -9,8 +9,8 @@ Residuals are white or first-order autoregressive, across windows too (``sipe_ba
 orientation is the rotation vector from the predicted to the measured one, three numbers of one noise scale.
 
 A start is the tangent (dq (nv), dv (nv), dact (na)) of the state at the one that the log measures, seen through the
-sensors of theta (``starts.measured``). Its normal prior is as wide as that measurement is uncertain, and far wider where
-nothing measures it (``Environment.start_sd``), so that the equations are not singular.
+sensors of theta (``starts.measured``). Its normal prior is as wide as that measurement is uncertain, and far wider
+where nothing measures it (``Environment.start_sd``), so that the equations are not singular.
 """
 
 from __future__ import annotations

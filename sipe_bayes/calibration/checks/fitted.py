@@ -15,7 +15,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.agreement import LogEstimates, disagreement, linear_estimates, log_estimates, parts_of
+from sipe_bayes.diagnostics.agreement import LogEstimates, linear_estimates, log_estimates, parts_of
 from sipe_bayes.diagnostics.evaluate import best_starts, channel_noise, white_noise
 from sipe_bayes.diagnostics.records import ChannelNoise, LogReport
 from sipe_bayes.inference.base import Estimator
@@ -119,7 +119,7 @@ def _noise_of(method: Estimator, windows: Windows, theta: FloatArray) -> Noise:
 def one_by_one(problem: Problem, fit: Fit, seed: int, checks: Checks) -> LogEstimates:
     """What each of several logs says by itself.
 
-    To first order, and where they then disagree, by a fit of each. Not asked of bodies that tumble: one log says too
+    To first order where a linearisation is at hand, else by a fit of each. Not asked of bodies that tumble: one log says too
     little of them by itself, and its scatter is in the posterior.
     """
 
@@ -128,8 +128,7 @@ def one_by_one(problem: Problem, fit: Fit, seed: int, checks: Checks) -> LogEsti
             return LogEstimates()
         if fit.lin is not None and fit.lin.valid:
             alone = linear_estimates(fit.windows, fit.theta, fit.starts, fit.noise, fit.lin, parts_of(fit.windows))
-            if disagreement(problem.environment.space, alone) is None:
-                return LogEstimates(tuple(alone))
+            return LogEstimates(tuple(alone))
         return log_estimates(problem.simulator, problem.likelihood, problem.train, fit.theta, seed, tell, kept)
 
     return checks.of(Check.LOGS, LogEstimates, made)

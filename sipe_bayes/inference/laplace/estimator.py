@@ -18,7 +18,7 @@ from sipe_bayes.inference import importance
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.importance import Draws, Judgement
 from sipe_bayes.inference.laplace.options import LaplaceOptions
-from sipe_bayes.inference.laplace.solver import SegmentSolver, SolverState, fits_segments
+from sipe_bayes.inference.laplace.solver import SolverState
 from sipe_bayes.inference.laplace.state_space.chain_draws import blur, draws_size, looked_beyond
 from sipe_bayes.inference.laplace.state_space.known_starts import KnownStartSearch, KnownStartState
 from sipe_bayes.inference.laplace.state_space.noise import excess
@@ -29,9 +29,8 @@ from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, contrad
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
 from sipe_bayes.inference.laplace.windows.draws import draw_size, more, probed, sharing
-from sipe_bayes.inference.laplace.windows.longer_windows import led_on
+from sipe_bayes.inference.laplace.windows.longer_windows import led_on, search_of
 from sipe_bayes.inference.laplace.windows.optimum import not_followed
-from sipe_bayes.inference.laplace.windows.search import WindowSearch
 from sipe_bayes.inference.laplace.windows.state import Followed, WindowOptimum, WindowState
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, StateSpace
@@ -177,9 +176,7 @@ class Laplace(Estimator[LaplaceState]):
     def _strategy(self, windows: Windows | Chain) -> Strategy[Any]:
         """The search that fits the likelihood."""
         if not isinstance(windows, Chain):
-            if fits_segments(windows):
-                return SegmentSolver(self.problem, windows)
-            return WindowSearch(self.problem, windows)
+            return search_of(self.problem, windows)
         known = windows.settings.starts == "recorded"
         return KnownStartSearch(self.problem, windows) if known else StateSpaceSearch(self.problem, windows)
 
@@ -194,10 +191,10 @@ class Laplace(Estimator[LaplaceState]):
             stands = not state.judgements or state.judgements[0].normal
             return self._looked_beyond(windows, state, target) if stands or not shots_left else state
         assert isinstance(state.search, WindowState)
-        if isinstance(state.search, SolverState):
-            return replace(state, done=True)
         if not (search := led_on(self.problem, windows, state.search)).done:
             return replace(state, search=search)
+        if isinstance(search, SolverState) and search.behind_noise:
+            return replace(ended, search=search)  # its interval is no likelihood's
         kept = distinct(search.optima)
         probe = probed(self.problem, windows, kept)
         if probe.stands:
@@ -273,7 +270,7 @@ class Laplace(Estimator[LaplaceState]):
         kept = distinct(state.search.optima)
         draws, elsewhere = more(self.problem, windows, kept, draws)
         if elsewhere:
-            search = WindowSearch(self.problem, windows).onward(state.search, draws.points[draws.values.argmax()])
+            search = search_of(self.problem, windows).onward(state.search, draws.points[draws.values.argmax()])
             if search is not None:
                 return replace(state, search=search, draws=None)
         done = importance.ended(draws, self.prior, self.options.tuning.importance, state.given)

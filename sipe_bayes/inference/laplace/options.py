@@ -31,8 +31,6 @@ class WindowTuning(Options):
     tolerance: float = option(0.02, "gain of a step below which the search stands still", "nats", above=0)
     rough_tolerance: float = option(1e-4, "the same while the noise is only guessed", "of the energy", above=0)
     most_steps: int = option(80, "steps from one starting point; rough ones take half of them at most", least=4)
-    subset_gain: float = option(0.5, "gain below which all windows are used, if it was foretold", "of the energy")
-    subset_gain_unforetold: float = option(0.1, "the same for a gain that was not foretold", "of the energy")
     foretold: float = option(0.2, "how well a kept Jacobian has to foretell a gain", "relative", above=0)
     most_drift: float = option(0.5, "how far what was foretold since it was taken may be wrong", "nats", above=0)
     open_sd: float = option(0.5, "sd from which a direction counts as open", "of the cube", above=0)
@@ -41,15 +39,6 @@ class WindowTuning(Options):
     most_patterns: int = option(20, "pattern searches that lead on from one starting point", least=0)
     most_points: int = option(10, "starting points, with those found on the way", least=1)
     trials: int = option(10, "rollouts that a step is allowed beside its linearisation", least=1)
-
-
-@dataclass(frozen=True)
-class WideDifferenceTuning(Options):
-    """Differences as long as the posterior is wide; see ``wide_differences``."""
-
-    rounds: int = option(3, "in which the normal grows, and is asked again", least=0)
-    wider: float = option(1.25, "their normal over that of short ones, from which it takes its place", above=1)
-    least_room: float = option(0.1, "of the way to both sides that the cube must leave an axis", above=0, most=2)
 
 
 @dataclass(frozen=True)
@@ -131,21 +120,6 @@ class ContactTuning(Options):
 
 
 @dataclass(frozen=True)
-class ScoutTuning(Options):
-    """How other values that fit as well are looked for; see ``scouting``."""
-
-    scouts: int = option(6, "starting points of theirs: each is cheap, and a wide valley holds one", least=0)
-    draws: int = option(64, "of the prior, of which they take those that are farthest apart", least=6)
-    steps: int = option(8, "of a scout, who comes to rest sooner", least=1)
-    least_windows: int = option(4, "that scouts look at", least=1)
-    most_windows: int = option(10, "the same at most, and a tenth of all: they need not be exact", least=1)
-    tolerance: float = option(1e-2, "gain of a step below which a scout rests", "of the energy", above=0)
-    as_good: float = option(2.0, "how much higher a further starting point may lie", "of the energy", above=1)
-    slack: float = option(20.0, "climb from one place to another within one valley", "nats", above=0)
-    most_points: int = option(2, "further starting points at most", least=0)
-
-
-@dataclass(frozen=True)
 class LongerTuning(Options):
     """When longer windows are tried where starts are not measured, and how; see ``windows.longer_windows``."""
 
@@ -163,9 +137,10 @@ class SolverTuning(Options):
     """How segments are fitted; see ``solver``."""
 
     damping: float = option(1e-3, "of the first step: nearly Gauss and Newton's", above=0)
-    tolerance: float = option(0.02, "gain of a step below which the fit has converged", "nats", above=0)
+    tolerance: float = option(0.05, "gain of a step below which the fit has converged", "nats a parameter", above=0)
     plain_gain: float = option(2.0, "gain of a step below which the plain fit has converged", "nats", above=0)
     most_steps: int = option(60, "steps from one starting point", least=2)
+    most_points: int = option(6, "starting points, with those found on the way", least=1)
     share: float = option(0.3, "of the conditional posterior sd, by which finite differences are long", above=0)
     first_length: float = option(1e-3, "of the first differences", "of the cube", above=0)
     shortest: float = option(1e-6, "of all differences", "of the cube", above=0)
@@ -187,12 +162,10 @@ class LaplaceTuning(Options):
     solver: SolverTuning = option(SolverTuning(), "how segments are fitted")
     screening: ScreeningTuning = option(ScreeningTuning(), "how starting points are chosen")
     windows: WindowTuning = option(WindowTuning(), "how the search over windows goes")
-    wide: WideDifferenceTuning = option(WideDifferenceTuning(), "differences as long as the posterior is wide")
     growing: GrowingTuning = option(GrowingTuning(), "how windows of bodies that tumble grow")
     followed: FollowedTuning = option(FollowedTuning(), "of which windows the posterior is through impacts")
     contact: ContactTuning = option(ContactTuning(), "how starting points through contact are found")
     longer: LongerTuning = option(LongerTuning(), "what is tried where starts are not measured and short windows fail")
-    scouting: ScoutTuning = option(ScoutTuning(), "how other values that fit as well are looked for")
     importance: ImportanceTuning = option(ImportanceTuning(), "draws where the posterior is no normal")
     stretches: StretchTuning = option(StretchTuning(), "how far a posterior is looked at beyond its normal")
     pattern: PatternTuning = option(PatternTuning(), "how the surroundings of an optimum are looked at")

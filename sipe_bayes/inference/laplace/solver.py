@@ -110,6 +110,7 @@ class SolverState(WindowState):
         compared: whether coloured noise has been held against plain least squares.
         freed: whether the mode's free-run error has been compared with the plain fit's.
         wider: by how much coloured residuals make the variance of plain least squares larger than white ones would.
+        scouted: whether further starting points were tried.
         behind: how many times the plain fit's that error was; 0 where it was not larger.
     """
 
@@ -117,8 +118,14 @@ class SolverState(WindowState):
     plain: FloatArray = field(default_factory=lambda: np.zeros(0))
     compared: bool = False
     freed: bool = False
+    scouted: bool = False
     wider: float = 1.0
     behind: float = 0.0
+
+    @property
+    def behind_noise(self) -> bool:
+        """Whether the interval is the sandwich, since coloured noise would have taken over what parameters explain."""
+        return self.here.white and (self.wider > 1 or self.behind > 0)
 
     @property
     def stage_begins(self) -> bool:
@@ -169,6 +176,16 @@ class SegmentSolver:
         if not valid:
             self.problem.find(finding(Code.DIVERGES_AS_GIVEN))
         return SolverState(theta[None], 0, self._begin(theta))
+
+    def onward(self, state: WindowState, theta: FloatArray, starts: FloatArray | None = None) -> SolverState | None:
+        """A fit that had ended, from a better place (N,) and initial states (W, D); None where it has had enough."""
+        assert isinstance(state, SolverState)
+        if len(state.points) >= self.tuning.most_points or self._leaves_no_room():
+            return None
+        here = replace(self._begin(theta), stage=Stage.FIT)
+        here = here if starts is None else replace(here, starts=starts, part=self._last(Stage.FIT))
+        points = np.concatenate([state.points, theta[None]])
+        return replace(state, points=points, point=len(state.points), here=here, done=False)
 
     def step(self, state: SolverState) -> SolverState:
         """One linearisation and the best of a batch of steps; or the comparison at the end."""
@@ -231,7 +248,7 @@ class SegmentSolver:
 
     def _screened(self, points: FloatArray, draws: int) -> tuple[FloatArray, bool]:
         """The first point if its simulation is valid, else the best of draws from the prior; and whether it was."""
-        keep, view = self._view(0)
+        view = self._view(0)[1]
         before = lent(self.windows, view)
         try:
             valid = bool(view.residuals(points, np.tile(view.no_starts(), (1, 1, 1)))[1][0])
@@ -281,7 +298,7 @@ class SegmentSolver:
         ]
 
     def _plain(self, state: SolverState) -> SolverState:
-        here, (keep, view) = state.here, self._view(state.here.part)
+        here, (_, view) = state.here, self._view(state.here.part)
         n, starts, before = view.num_theta, view.no_starts(), lent(self.windows, view)
         try:
             scale = self._lengths(view, here)
@@ -359,7 +376,7 @@ class SegmentSolver:
                 state = replace(state, compared=True, wider=wider if takes_over else 1.0)
             moments = view.moments(lin, white=here.white)
             noise = here.noise
-            if here.iteration == 0 or here.stage is Stage.FIT and not here.noise.tau.any():
+            if here.iteration == 0 or (here.stage is Stage.FIT and not here.noise.tau.any()):
                 noise = present_noise(view, lin.residual)
             noise = updated_noise(
                 view, moments, noise, here.theta, here.starts[keep], self.prior, not here.white, held=False
@@ -376,8 +393,6 @@ class SegmentSolver:
             scale=scale if hessian is None else hessian,
             misfit=here.misfit or misfit(view, lin.residual),
         )
-        import os
-        if os.environ.get('DBG'): print('   FIT expected %.3f gained %.3f damp %.1e fresh %s' % (trial.expected, trial.gained, trial.damping, fresh))
         small = trial.expected < tolerance or (trial.gained < tolerance and here.damping <= 1.0)
         settled = small and same_noise(noise, here.noise)
         stuck = trial.gained <= 0 and here.damping >= 1e3
@@ -423,10 +438,6 @@ class SegmentSolver:
                 middle = sandwich(lin.jacobian, solved.slope, white.sd, view.sequences, noise)
                 spread, plain = inverse @ (middle + prior) @ inverse, inverse
         apart = steps[1] - steps[0]
-        import os
-
-        if os.environ.get("DBG"):
-            print("HAUSMAN", apart @ np.linalg.solve(spread, apart), n, "tau", noise.tau)
         wider = float(np.exp(np.log(np.diag(spread) / np.diag(plain)).mean()))
         return bool(chi2.sf(apart @ np.linalg.solve(spread, apart), n) < self.tuning.takes_over), max(wider, 1.0)
 
@@ -551,7 +562,7 @@ class SegmentSolver:
 
     def _further(self, state: SolverState) -> SolverState:
         """Further starting points: the best of draws from the prior."""
-        keep, view = self._view(0)
+        view = self._view(0)[1]
         options = self.problem.options
         generator = torch.Generator().manual_seed(self.problem.seed + 1)
         drawn = self.problem.prior.sample((max(options.candidates, 1),), generator=generator).numpy()

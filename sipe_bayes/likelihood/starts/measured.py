@@ -33,9 +33,7 @@ class MeasuredStarts:
     numbers: IntArray
     _earlier: dict[tuple[int, bytes], FloatArray] = field(default_factory=dict)
 
-    def offsets(
-        self, theta: FloatArray, log: IntArray, start: IntArray, reference: FloatArray
-    ) -> FloatArray | None:
+    def offsets(self, theta: FloatArray, log: IntArray, start: IntArray, reference: FloatArray) -> FloatArray | None:
         """Tangents (B, W, D) from the reference to what theta's sensors say was measured; None where nothing differs.
 
         A filter is taken for a delay of its time constant.

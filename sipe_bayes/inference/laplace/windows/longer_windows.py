@@ -18,6 +18,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.inference.laplace.solver import SegmentSolver, fits_segments
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.laplace.windows.growing_windows import level
 from sipe_bayes.inference.laplace.windows.search import WindowSearch
@@ -40,6 +41,11 @@ class Trail:
 
     theta: FloatArray
     states: Sequence[FloatArray]
+
+
+def search_of(problem: SearchProblem, windows: Windows) -> SegmentSolver | WindowSearch:
+    """What fits the windows."""
+    return SegmentSolver(problem, windows) if fits_segments(windows) else WindowSearch(problem, windows)
 
 
 def led_on(problem: SearchProblem, windows: Windows, state: WindowState) -> WindowState:
@@ -66,7 +72,7 @@ def led_on(problem: SearchProblem, windows: Windows, state: WindowState) -> Wind
     if not valid[0] or not np.log(left / best.sd).mean() < np.log(tuning.better):
         return tried
     fresh = replace(tried, optima=(), wild=np.zeros((0, 3), np.int64))
-    return WindowSearch(problem, windows).onward(fresh, trail.theta, starts) or tried
+    return search_of(problem, windows).onward(fresh, trail.theta, starts) or tried
 
 
 def trailed(
@@ -82,7 +88,7 @@ def trailed(
     logs = Trajectories.stack([replace(one, states=None) for one in trajectories])
     windows = bind(lengthened, simulator, logs)
     windows.budget = budget
-    search, optima = WindowSearch(replace(problem, find=lambda _: None), windows), tuple[WindowOptimum, ...]()
+    search, optima = search_of(replace(problem, find=lambda _: None), windows), tuple[WindowOptimum, ...]()
     try:
         state = search.start()
         while not state.done:

@@ -22,7 +22,7 @@ from sipe_bayes.inference.laplace.windows.energy import (
     unevenly_left,
     updated_noise,
 )
-from sipe_bayes.inference.laplace.windows.growing_windows import grows, level
+from sipe_bayes.inference.laplace.windows.growing_windows import level
 from sipe_bayes.inference.laplace.windows.pattern_search import (
     Surroundings,
     nearest_points,
@@ -30,13 +30,12 @@ from sipe_bayes.inference.laplace.windows.pattern_search import (
     pattern_size,
 )
 from sipe_bayes.inference.laplace.windows.state import WindowOptimum
-from sipe_bayes.inference.laplace.windows.wide_differences import WideDifferences
 from sipe_bayes.likelihood.block_tridiagonal import Eliminated
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.noise_spread import noise_cloud, sandwich
 from sipe_bayes.likelihood.restricted import eliminate_starts, restricted
-from sipe_bayes.likelihood.windows import Linearisation, Windows
+from sipe_bayes.likelihood.windows import Windows
 
 _HELD = 1e-6  # of the cube: a parameter that the search left on its bound
 
@@ -116,31 +115,6 @@ def summarised(problem: SearchProblem, windows: Windows, ending: Ending) -> Wind
     for weight, centre in centres:
         covariance += weight * np.outer(centre - mean, centre - mean)
     return WindowOptimum(theta, mean, covariance, evidence, noise.sd, noise.tau, starts, solved.slope)
-
-
-def widened(problem: SearchProblem, windows: Windows, ending: Ending) -> WindowOptimum:
-    """The same, by differences as long as the normal is wide where that makes it wider; see ``wide_differences``.
-
-    Not asked where the starts are known, where an end is none, where windows grow or all differences are long already.
-    """
-    optimum, tuning = summarised(problem, windows, ending), problem.options.tuning.wide
-    ends = ending.settled and ending.refused <= problem.options.tuning.windows.most_drift
-    short = windows.least_steps(ending.theta) == 0
-    if not ends or not windows.num_start or grows(windows) or not short.any():
-        return optimum
-    missing = 0.0
-    for _ in range(tuning.rounds):
-        if not windows.has_room(2 * int(short.sum())):
-            break
-        seen = WideDifferences.of(problem, windows, optimum, ending.noise, ending.residual, ending.jacobian)
-        lin = Linearisation(ending.residual, seen.jacobian, True)
-        moments = windows.moments(lin, white=windows.settings.noise == "white")
-        wide = summarised(problem, windows, replace(ending, moments=moments, jacobian=seen.jacobian))
-        missing = 0.0 if sandwiches(windows) else seen.missing  # whose width is no likelihood's
-        if wide.over(optimum) < tuning.wider:
-            break
-        optimum = wide
-    return replace(optimum, finding=finding(Code.NOT_SMOOTH, gain=missing)) if missing else optimum
 
 
 def sandwiches(windows: Windows) -> bool:

@@ -1,7 +1,6 @@
 """The search over windows, from starting point to recorded optimum, in phases.
 
-Where the log tells the windows' starts, theta moves alone first, on every other window, until a step gains little; not
-through contact, where starting points are at rest on all windows already. The Jacobian of the starts is kept as long as
+The Jacobian of the starts is kept as long as
 it foretells the gain of a step to a fifth; an optimum is only accepted where what was foretold since it was taken is
 wrong by less than half a nat. A later starting point is dropped once the search has all but come to an optimum that is
 already known. Where the best one leaves more than the noise of known starts, the search begins anew while it may.
@@ -39,7 +38,7 @@ from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.inference.laplace.levenberg_marquardt import Descent, descend
 from sipe_bayes.inference.laplace.options import LaplaceTuning
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.inference.laplace.windows.contact_starts import begins_in_contact, started_anew, starting_points
+from sipe_bayes.inference.laplace.windows.contact_starts import started_anew, starting_points
 from sipe_bayes.inference.laplace.windows.energy import (
     LinearisedWindows,
     WindowEnergy,
@@ -67,11 +66,10 @@ from sipe_bayes.inference.laplace.windows.optimum import (
     judged,
     middle_of_ridge,
     sandwiches,
+    summarised,
     surroundings,
-    widened,
 )
 from sipe_bayes.inference.laplace.windows.pattern_search import SHORTEST, pattern_size
-from sipe_bayes.inference.laplace.windows.scouting import may_scout, scouted
 from sipe_bayes.inference.laplace.windows.state import Kept, Phase, Position, WindowState
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
@@ -80,7 +78,7 @@ from sipe_bayes.likelihood.wild_samples import wild_residuals
 from sipe_bayes.likelihood.windows import Linearisation, Windows
 from sipe_bayes.simulation.contacts import may_touch
 
-_ROUGH = (Phase.WHOLE, Phase.ROUGH)
+_ROUGH = (Phase.ROUGH,)
 
 
 @dataclass(frozen=True)
@@ -127,13 +125,10 @@ class WindowSearch:
         self.windows.mask(state.wild)
         phases: dict[Phase, Callable[[WindowState], WindowState]] = {
             Phase.GROW: self._grow,
-            Phase.SUBSET: self._subset,
-            Phase.WHOLE: self._whole,
             Phase.ROUGH: self._rough,
             Phase.DESCEND: self._descend,
             Phase.NOISE: self._noise,
             Phase.FOLLOW: partial(followed_step, self.problem, self.windows),
-            Phase.SCOUT: self._scout,
         }
         return phases[state.here.phase](state)
 
@@ -160,8 +155,6 @@ class WindowSearch:
         onward = state.next_point(self._begin)
         if onward.done and (anew := started_anew(self.problem, self.windows, state)) is not None:
             return replace(state, points=np.concatenate([state.points, anew])).next_point(self._begin)
-        if onward.done and not state.scouted and state.optima and may_scout(self.problem, self.windows):
-            return replace(state, here=replace(state.here, phase=Phase.SCOUT))
         if not (onward.done and grows(self.windows)) or not state.optima:
             return onward
         if num_groups(self.windows, self._tuning.growing):
@@ -176,60 +169,18 @@ class WindowSearch:
         """A search that had ended, from a better place (N,), and starts (W, D); None where it has had enough."""
         if len(state.points) >= self._tuning.windows.most_points or self._leaves_no_room():
             return None
-        points, here = np.concatenate([state.points, theta[None]]), self._begin(theta, subset=starts is None)
+        points, here = np.concatenate([state.points, theta[None]]), self._begin(theta)
         here = here if starts is None else replace(here, starts=starts)
         return replace(state, points=points, point=len(state.points), here=here, done=False)
-
-    def _scout(self, state: WindowState) -> WindowState:
-        """Further starting points, from which the search goes on."""
-        points = np.concatenate([state.points, scouted(self.problem, self.windows, state.optima)])
-        return self._next(replace(state, points=points, scouted=True))
 
     def _apart(self, number: int, state: WindowState) -> Position:
         """Where a group of windows is fitted from: the best optimum's theta, and starts of its own."""
         best = max(state.optima, key=lambda optimum: optimum.evidence)
         part = group(self.windows, number, num_groups(self.windows, self._tuning.growing))
-        at = Position.at(part, best.theta, self._tuning.damping, subset=False)
+        at = Position.at(part, best.theta, self._tuning.damping)
         here = first_beginnings(part, at, self._tuning.growing, state.here)
         counted(self.windows, part, self.windows.rollouts)
         return replace(here, group=number)
-
-    def _subset(self, state: WindowState) -> WindowState:
-        """A step of theta alone on every other window, starts as the log tells them; near the optimum all follow."""
-        windows, here, tuning = self.windows, state.here, self._tuning.windows
-        view = windows.every_other()
-        before, starts, kept = view.rollouts, view.no_starts(), here.kept.residual
-        lin = view.linearise(here.theta, starts, with_starts=False, residual=kept)
-        fixed = np.zeros((*lin.residual.shape, windows.num_start))
-        lin = replace(lin, jacobian=np.concatenate([lin.jacobian, fixed], axis=-1))
-        energy = WindowEnergy(view, present_noise(view, lin.residual), self.problem.quadratic_prior)
-        point = WindowPoint(here.theta, starts, lin.residual)
-        linearised = LinearisedWindows(energy, point, view.moments(lin, white=True))
-        tolerance = max(tuning.rough_tolerance * linearised.energy, tuning.tolerance)
-        fit = descend(linearised, here.damping, tolerance, self._tuning.damping)
-        counted(windows, view, before)
-        point = fit.point or point
-        least = tuning.subset_gain if foretold(fit, tuning) else tuning.subset_gain_unforetold
-        again = not fit.converged and fit.gained > least * linearised.energy
-        again = again and here.iteration + 1 < tuning.most_steps // 4 and not self._leaves_no_room()
-        here = replace(
-            here,
-            phase=Phase.SUBSET if again else Phase.WHOLE,
-            theta=point.theta,
-            damping=fit.damping,
-            iteration=here.iteration + 1,
-            misfit=here.misfit or misfit(view, lin.residual),
-            kept=replace(here.kept, residual=point.residual if again or view is windows else None),
-        )
-        state = replace(state, here=here)
-        return self._next(state) if state.known else state
-
-    def _whole(self, state: WindowState) -> WindowState:
-        """The first step on all windows: every other one went well, but perhaps not all do."""
-        lin, stale, drift = self._linearise(state.here)
-        if not lin.valid:
-            return replace(state, here=self._begin(state.points[state.point], subset=False))
-        return self._with_present_noise(state, lin, stale, drift)
 
     def _rough(self, state: WindowState) -> WindowState:
         """A step with white noise of the size of the present residuals, to a relative tolerance."""
@@ -357,7 +308,7 @@ class WindowSearch:
             cut_short=cut_short,
             bettered=state.optima[-1] if here.patterns else None,
         )
-        optimum = widened(self.problem, windows, ending)
+        optimum = summarised(self.problem, windows, ending)
         afresh, stays = here.afresh(tuning.damping), here.centred or cut_short
         if (further := None if stays else middle_of_ridge(self.problem, windows, optimum)) is not None:
             return replace(state, here=replace(afresh, theta=further, centred=True))
@@ -375,10 +326,9 @@ class WindowSearch:
         better = replace(afresh, theta=around.better, theta_step=size, iteration=0, patterns=here.patterns + 1)
         return replace(state, here=better)
 
-    def _begin(self, theta: FloatArray, subset: bool = True) -> Position:
-        """At a starting point theta (N,); subset: whether every other window may be tried first."""
-        subset = subset and self.windows.starts_measured and not begins_in_contact(self.windows)
-        here = Position.at(self.windows, theta, self._tuning.damping, subset)
+    def _begin(self, theta: FloatArray) -> Position:
+        """At a starting point theta (N,)."""
+        here = Position.at(self.windows, theta, self._tuning.damping)
         return first_beginnings(self.windows, here, self._tuning.growing) if grows(self.windows) else here
 
     def _leaves_no_room(self) -> bool:

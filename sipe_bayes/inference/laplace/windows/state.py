@@ -22,10 +22,6 @@ class Phase(StrEnum):
 
     GROW = auto()
     """Of bodies that tumble: theta and the starts on beginnings of the windows, ever longer."""
-    SUBSET = auto()
-    """Theta alone, on every other window, the starts as the log tells them."""
-    WHOLE = auto()
-    """The first step after that on all windows, which may diverge where the others did not."""
     ROUGH = auto()
     """White noise of the size of the present residuals."""
     DESCEND = auto()
@@ -34,8 +30,6 @@ class Phase(StrEnum):
     """The noise is estimated anew before the step."""
     FOLLOW = auto()
     """After groups of windows were fitted apart: towards the optimum of those that are followed; see ``followed``."""
-    SCOUT = auto()
-    """After the last starting point: other values that fit as well; see ``scouting``."""
 
 
 @dataclass(frozen=True)
@@ -100,16 +94,12 @@ class Position:
     jumps: bool = False
 
     @classmethod
-    def at(cls, windows: Windows, theta: FloatArray, rule: DampingRule, subset: bool) -> Self:
-        """At a starting point theta (N,), with a first guess of white noise, which the first step replaces.
-
-        subset: whether every other window is to be tried first.
-        """
+    def at(cls, windows: Windows, theta: FloatArray, rule: DampingRule) -> Self:
+        """At a starting point theta (N,), with a first guess of white noise, which the first step replaces."""
         fixed = windows.fixed_sd
         sd = np.where(np.isnan(fixed), np.maximum(0.1 * windows.spread, 1e-9), fixed)
-        phase = Phase.SUBSET if subset else Phase.ROUGH
         noise = Noise(sd, np.zeros(len(sd)))
-        return cls(phase, theta, windows.no_starts(), noise, rule.first, windows.theta_step)
+        return cls(Phase.ROUGH, theta, windows.no_starts(), noise, rule.first, windows.theta_step)
 
     def afresh(self, rule: DampingRule) -> Self:
         """The same point without anything that was kept of earlier ones, and without a new noise."""
@@ -208,7 +198,6 @@ class WindowState(StrategyState[Position]):
     Args:
         estimates: (N,) each, of groups of windows that were fitted apart.
         aside: the optima as they were recorded, while these are.
-        scouted: whether other values that fit as well have been looked for.
         wild: (k, 3), samples that are left out; see ``likelihood.wild_samples``.
         longer: whether the search has gone on from where longer windows led.
     """
@@ -217,7 +206,6 @@ class WindowState(StrategyState[Position]):
     optima: tuple[WindowOptimum, ...] = ()
     estimates: tuple[FloatArray, ...] = ()
     aside: tuple[WindowOptimum, ...] = ()
-    scouted: bool = False
     wild: IntArray = field(default_factory=lambda: np.zeros((0, 3), np.int64))
     longer: bool = False
 
