@@ -148,8 +148,8 @@ class Windows:
         self.filters = FilterStarts(simulator, trajectories, self.reference, self.log, self.start, recorded)
         free = start_sd(simulator, trajectories) if self.settings.starts == "estimated" else np.zeros(0)
         self.num_start, self.start_precision = len(free), free**-2.0
-        known, slopes = (part[: len(free)] for part in measurement_sd(simulator, trajectories))
-        self.measured_precision = np.minimum(free, np.maximum(known, 1e-9)) ** -2.0
+        tight, slopes = measurement_sd(simulator, trajectories)
+        self.measured_precision = np.minimum(free, np.maximum(tight[: len(free)], 1e-9)) ** -2.0
         if self.settings.noise != "ar1":
             self.start_precision = self.measured_precision
         elif len(free):  # coloured noise hides in what is measured itself, not in its slopes

@@ -119,8 +119,8 @@ def _noise_of(method: Estimator, windows: Windows, theta: FloatArray) -> Noise:
 def one_by_one(problem: Problem, fit: Fit, seed: int, checks: Checks) -> LogEstimates:
     """What each of several logs says by itself.
 
-    To first order where a linearisation is at hand, else by a fit of each. Not asked of bodies that tumble: one log says too
-    little of them by itself, and its scatter is in the posterior.
+    To first order where a linearisation is at hand, else by a fit of each. Not asked of bodies that tumble: one log
+    says too little of them by itself, and its scatter is in the posterior.
     """
 
     def made(tell: Tell, kept: Kept) -> LogEstimates:

@@ -36,8 +36,9 @@ from sipe_bayes.likelihood.noise import Noise, coefficients, whiten
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
 from sipe_bayes.likelihood.windows import Linearisation, Windows
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.structure.extension import Extension
-from sipe_bayes.structure.probes import probes
+from sipe_bayes.structure.probes import probes, probes_cost
 
 FLAT_PRECISION = 1e-6  # keeps information invertible where a direction is open
 _SHORT = 50  # samples, of which no memory is asked
@@ -54,6 +55,7 @@ class MisfitOptions(Options):
     lags: tuple[int, ...] = option((1, 2, 3, 5, 8, 13, 21, 34), "of a channel's memory, at every scale", "samples")
     alike: float = option(0.8, "of the best probe's statistic, from which another cause is named beside it", least=0)
     causes: int = option(3, "that are named at most", least=1)
+    simulated_steps: float = option(1e6, "physics steps of all probes together, about", above=0)
     steps: int = option(4000, "of windows spread evenly over long logs: each probe is a simulation", "control steps")
     hides: float = option(1.4, "of the samples' scatter: from here on noise hides as much again", above=1)
     rounding: float = option(2.0, "of the simulation's rounding, below which noise is that", least=1)
@@ -104,6 +106,15 @@ class _Null:
     rows: list[FloatArray] = field(default_factory=list)
 
 
+def steps_of(windows: Windows, theta: FloatArray) -> int:
+    """Control steps of the windows that are probed: so many that all probes together stay within their cost."""
+    if isinstance(windows.simulator, CallableSimulator):
+        return MISFIT.steps
+    each = max(probes_cost(windows, theta) / len(windows.trajectories), 1.0)
+    skip = windows.simulator.physics_steps(float(windows.dt.min()))[0]
+    return int(min(MISFIT.steps, MISFIT.simulated_steps / (each * skip)))
+
+
 class ProbedLogs:
     """The logs linearised at the estimate, with K probes beside the N parameters.
 
@@ -138,7 +149,7 @@ class ProbedLogs:
         extensions: Sequence[Extension] | None = None,
         steady: bool = True,
     ) -> None:
-        some = spread_windows(windows, MISFIT.steps)
+        some = spread_windows(windows, steps_of(windows, theta))
         if len(some) < windows.num_windows:
             windows, starts = windows.part(some), None if starts is None else starts[some]
             lin = None if lin is None else Linearisation(lin.residual[some], lin.jacobian[some], lin.valid)

@@ -187,8 +187,9 @@ class SegmentSolver:
         points = np.concatenate([state.points, theta[None]])
         return replace(state, points=points, point=len(state.points), here=here, done=False)
 
-    def step(self, state: SolverState) -> SolverState:
+    def step(self, state: WindowState) -> SolverState:
         """One linearisation and the best of a batch of steps; or the comparison at the end."""
+        assert isinstance(state, SolverState)
         self.windows.mask(state.wild)
         self._views = {}
         stages = {Stage.PLAIN: self._plain, Stage.FIT: self._fit, Stage.COMPARE: self._compare}
@@ -421,18 +422,20 @@ class SegmentSolver:
         """Whether coloured noise would move theta farther from plain least squares than coloured noise itself could.
 
         Hausman's specification test (J. Hausman 1978, "Specification Tests in Econometrics", Econometrica 46): if the
-        noise is coloured and the model right, the steps of plain and of generalised least squares differ by no more than
-        the sandwich covariance of the plain one.
+        noise is coloured and the model right, the steps of plain and of generalised least squares differ by no more
+        than the sandwich covariance of the plain one.
         """
         white, starts = present_noise(view, lin.residual), here.starts[self._view(here.part)[0]]
         n, pull = view.num_theta, -view.start_precision * starts
         prior = self.prior.precision + FLAT_PRECISION * np.eye(n)
         coloured = view.moments(lin)
         noise = updated_noise(view, coloured, white, here.theta, starts, self.prior, coloured=True, held=False)
-        steps, spread, plain = [], np.eye(n), np.eye(n)
+        steps: list[FloatArray] = []
+        spread: FloatArray = np.eye(n)
+        plain: FloatArray = np.eye(n)
         for moments, own in ((view.moments(lin, white=True), white), (coloured, noise)):
             solved = eliminate_starts(moments.normal(own), n, view.start_precision, pull)
-            inverse = np.linalg.inv(solved.precision + prior)
+            inverse: FloatArray = np.asarray(np.linalg.inv(solved.precision + prior), np.float64)
             steps.append(inverse @ (solved.gradient + self.prior.pull(here.theta)))
             if own is white:
                 middle = sandwich(lin.jacobian, solved.slope, white.sd, view.sequences, noise)

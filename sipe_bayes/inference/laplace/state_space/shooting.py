@@ -55,7 +55,7 @@ def shot(
         windows.budget = limit - chain.rollouts
         try:
             windows.reference = _best_starts(windows, theta, [one[_rows(chain, windows)] for one in states])
-            here = Position.at(windows, theta, tuning.damping, subset=False)
+            here = Position.at(windows, theta, tuning.damping)
             here = replace(here, horizon=min(horizon, int(windows.steps.max())))
             for _ in range(shooting.rounds):
                 here = replace(here, starts=_sought(chain, windows, here, shooting, rng))
