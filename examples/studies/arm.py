@@ -69,7 +69,15 @@ def ours(simulator: sipe.Simulator, log: sipe.Trajectory, seed: int) -> dict[str
     posterior = estimator.fit(log)
     low, high = posterior.quantile([(1 - LEVEL) / 2, (1 + LEVEL) / 2]).numpy()
     values = [LOW + (HIGH - LOW) * x for x in (posterior.mean.numpy(), low, high)]
-    return {**_row(*values), "rollouts": estimator.rollouts, "warnings": estimator.warnings}
+    truth = (TRUTH - LOW) / (HIGH - LOW)
+    return {
+        **_row(*values),
+        "sds_off": ((posterior.mean.numpy() - truth) / posterior.stddev.numpy()).round(3).tolist(),
+        "sd": posterior.stddev.tolist(),
+        "blocked": bool(estimator.findings.blocking),
+        "rollouts": estimator.rollouts,
+        "warnings": estimator.warnings,
+    }
 
 
 def theirs(log: sipe.Trajectory) -> dict[str, Any]:

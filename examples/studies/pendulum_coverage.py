@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,7 @@ def one_fit(problem: Problem, estimator: str, rho: float, seed: int) -> dict[str
     method = sipe.get_estimator(
         problem.simulator, estimator, likelihood=likelihood, seed=seed, budget=BUDGET[estimator]
     )
+    begin = time.process_time()
     posterior = method.fit(log)
     low, high = posterior.quantile([0.05, 0.95]).numpy()
     return {
@@ -63,6 +65,11 @@ def one_fit(problem: Problem, estimator: str, rho: float, seed: int) -> dict[str
         "truth": theta.tolist(),
         "covered": ((low <= theta) & (theta <= high)).tolist(),
         "contraction": (1 - posterior.stddev.numpy() * np.sqrt(12)).tolist(),
+        "sds_off": ((posterior.mean.numpy() - theta) / posterior.stddev.numpy()).round(3).tolist(),
+        "sd": posterior.stddev.tolist(),
+        "findings": [str(item.code) for item in method.findings],
+        "blocked": bool(method.findings.blocking),
+        "cpu_s": round(time.process_time() - begin, 2),
         "rollouts": method.rollouts,
         "diagnostics": {k: v for k, v in method.diagnostics.items() if k != "mixing"},
         "mixing": method.diagnostics.get("mixing"),

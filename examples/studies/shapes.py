@@ -54,6 +54,7 @@ def one_fit(machine: str, seed: int) -> dict[str, Any]:
         "seed": seed,
         "inside": ((low <= theta) & (theta <= high)).tolist(),
         "sds_off": ((posterior.mean.numpy() - theta) / posterior.stddev.numpy()).round(3).tolist(),
+        "sd": posterior.stddev.tolist(),
         "findings": [str(item.code) for item in method.findings],
         "blocked": bool(method.findings.blocking),
         "rollouts": method.rollouts,

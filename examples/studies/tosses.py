@@ -94,6 +94,7 @@ def one_fit(body: str, seed: int, count: int) -> dict[str, Any]:
         "inside": ((low <= theta) & (theta <= high)).tolist(),
         "width": (high - low).round(4).tolist(),
         "sds_off": ((posterior.mean.numpy() - theta) / posterior.stddev.numpy()).round(3).tolist(),
+        "sd": posterior.stddev.tolist(),
         "findings": [str(item.code) for item in method.findings],
         "blocked": bool(method.findings.blocking),
         "rollouts": method.rollouts,

@@ -94,8 +94,10 @@ def one_fit(machine: str, likelihood: sipe.Segments | sipe.StateSpace, seed: int
     low, high = posterior.quantile([0.05, 0.95]).numpy()
     return {
         "z": ((posterior.mean.numpy() - theta) / posterior.stddev.numpy()).tolist(),
+        "sd": posterior.stddev.tolist(),
         "held": ((low <= theta) & (theta <= high)).tolist(),
         "blocked": any(item.severity is Severity.BLOCKING for item in estimator.findings),
+        "rollouts": estimator.rollouts,
         "seconds": time.process_time() - begin,
     }
 
