@@ -12,7 +12,7 @@ from contextlib import contextmanager
 import typer
 
 from sipe_bayes.cli.surroundings import broken_import, drop_output
-from sipe_bayes.core.files import FULL, printed, reason
+from sipe_bayes.core.files import FULL, printed, reason, was_interruption
 from sipe_bayes.core.validation import MOST, MOST_ROLLOUTS, most_threads
 
 BAD_INPUT = 2
@@ -78,14 +78,6 @@ def exit_code_of(error: Exception) -> int | None:
         return 1
     print(f"sipe: standard output: {os.strerror(error.errno or 0).lower()}; free some space there", file=sys.stderr)
     return BAD_INPUT
-
-
-def was_interruption(error: BaseException) -> bool:
-    """Whether an exception is what a library made of an interruption, as native modules do while they are imported."""
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, KeyboardInterrupt):
-        cause = cause.__cause__ or cause.__context__
-    return cause is not None
 
 
 def say_interrupted(then: str) -> None:

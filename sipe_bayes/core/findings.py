@@ -19,6 +19,7 @@ _ONE = re.compile(r"(?<![\w.,])1 (column|draw|group|log|sample|simulation|step|s
 _LACKS = (Code.MISFIT, Code.MISFIT_SHIFTS)
 _UNFINISHED = (
     Code.BUDGET_SPENT,
+    Code.TIME_LIMIT,
     Code.SEARCH_CUT_SHORT,
     Code.SEARCH_UNSETTLED,
     Code.PROCESS_NOISE_UNSETTLED,
