@@ -130,6 +130,7 @@ class Simulator(Simulated):
         valid = np.logical_and.accumulate(motion.valid, axis=1)
         self.diverged += int((~valid[:, -1]).sum())
         self.control_steps += batch * horizon
+        Simulated.total_steps += batch * horizon
         length = np.full(batch, horizon)
         rewards = self.environment.rewards(motion.states, motion.derived, actions, goals)
         rewards = None if rewards is None else np.where(valid[:, 1:], rewards, 0.0)
