@@ -130,6 +130,10 @@ def calibrate(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
     threads: Annotated[int | None, typer.Option(help="Native threads; default all cores.")] = None,
     device: SimulatedOn = "cpu",
+    time_limit: Annotated[
+        float | None,
+        typer.Option(help="Seconds; then the search ends with its best estimate, and checks are skipped."),
+    ] = None,
 ) -> None:
     """Posterior of a simulator's parameters from logs of the real machine."""
     from sipe_bayes.calibration.discover import run_discovery
@@ -139,7 +143,8 @@ def calibrate(
     with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json) as progress:
         check_least(0, seed=seed)
         check_least(1, budget=budget, threads=threads)
-        calibration = run(config, estimator, seed, budget, out, threads, progress, device, _say_early)
+        check_least(0, time_limit=time_limit)
+        calibration = run(config, estimator, seed, budget, out, threads, progress, device, _say_early, time_limit)
     discovery = None
     if discover:
         with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json, counted=False) as progress:
