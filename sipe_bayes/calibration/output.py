@@ -25,8 +25,7 @@ from sipe_bayes.core.files import (
     write_bytes,
     write_text,
 )
-from sipe_bayes.core.findings import Code, Finding, finding
-from sipe_bayes.core.guard import Guard, NotMade
+from sipe_bayes.core.findings import Code, Finding, Guard, NotMade, finding
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.envs.export import ExportError, write_identified
 from sipe_bayes.envs.randomization_code import write_randomization

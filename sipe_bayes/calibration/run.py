@@ -39,8 +39,7 @@ from sipe_bayes.calibration.problem import Problem, method_of, prepare
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept, fingerprint_of
 from sipe_bayes.core.files import installed_version
-from sipe_bayes.core.findings import Code, Finding, Findings, finding
-from sipe_bayes.core.guard import Guard, Outcome
+from sipe_bayes.core.findings import Code, Finding, Findings, Guard, Outcome, finding
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.agreement import Disagreement, LogEstimates, disagreement
 from sipe_bayes.diagnostics.bands import band_coverage

@@ -17,6 +17,8 @@ from sipe_bayes.core.validation import MOST, MOST_ROLLOUTS, most_threads
 
 BAD_INPUT = 2
 """Exit code where input is at fault."""
+NOTHING_USABLE = 3
+"""Exit code of a calibration that ended, but none of whose values may be used within their intervals."""
 _LONGEST = 1000  # characters of a word of the command line
 _announced: list[str] = []  # interruptions that the command itself put into words
 INTERRUPTED = 130  # exit code, as shells have it for SIGINT

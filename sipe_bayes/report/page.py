@@ -21,8 +21,7 @@ from matplotlib.figure import Figure
 
 from sipe_bayes.core.files import write_bytes
 from sipe_bayes.core.finding_advice import ADVICE
-from sipe_bayes.core.findings import Code, Finding, Findings, Severity
-from sipe_bayes.core.guard import Guard
+from sipe_bayes.core.findings import Code, Finding, Findings, Guard, Severity
 from sipe_bayes.core.html import Page
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.thresholds import THRESHOLDS
