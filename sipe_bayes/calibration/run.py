@@ -40,7 +40,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept, fingerprint_of
 from sipe_bayes.core.files import installed_version
 from sipe_bayes.core.findings import Code, Finding, Findings, Guard, Outcome, finding
-from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.core.validation import at_least
 from sipe_bayes.diagnostics.agreement import Disagreement, LogEstimates, disagreement
 from sipe_bayes.diagnostics.bands import band_coverage
 from sipe_bayes.diagnostics.records import Mixing
@@ -53,7 +53,7 @@ from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import StateSpace
 from sipe_bayes.likelihood.state_space.process_noise import process_noise_findings
-from sipe_bayes.posterior import Particles, Posterior
+from sipe_bayes.posterior import Particles
 
 S = TypeVar("S")
 
@@ -83,13 +83,17 @@ def calibrate(
     """
     began = time.monotonic()
     method = method_of(problem, estimator, seed, budget, checkpoint, progress)
-    method.time_limit = math.inf if time_limit is None else time_limit
+    method.time_limit = math.inf if time_limit is None else at_least("time_limit", time_limit, 0)
     guard, plan = Guard(began + method.time_limit), NO_PLAN
     if progress is not None:
         plan = guard.run("forecast", lambda: plan_of(problem, method)).otherwise(plan)
         method.progress = with_checks(progress, plan, method, len(problem.train))
     posterior = method.fit(problem.train)
-    marginals = guard.run("marginals of the posterior", lambda: _marginals(problem, method, posterior))
+    model, space = problem.simulator.model, problem.environment.space
+    marginals = guard.run(
+        "marginals of the posterior",
+        lambda: Marginals.of(posterior, problem.prior, method.seed, bounded_by_nature(model, space)),
+    )
     first = Calibration(
         name=run_name(problem.config.path),
         estimator=method.name,
@@ -113,11 +117,6 @@ def calibrate(
     return replace(result, seconds=time.monotonic() - began)
 
 
-def _marginals(problem: Problem, method: Estimator, posterior: Posterior) -> Marginals:
-    natural = bounded_by_nature(problem.simulator.model, problem.environment.space)
-    return Marginals.of(posterior, problem.prior, method.seed, natural)
-
-
 def _kept(problem: Problem, method: Estimator, checkpoint: Path | None) -> Kept:
     """What keeps the results of the checks: those of this very fit."""
     held = None if problem.holdout is None else digest(problem.holdout)
@@ -129,9 +128,16 @@ def _kept(problem: Problem, method: Estimator, checkpoint: Path | None) -> Kept:
 
 @dataclass(frozen=True)
 class _Answers:
-    """What the checks say, each as far as it came to its end; logs are without the samples that the fit left out."""
+    """What the checks say, each as far as it came to its end.
 
-    logs: Trajectories
+    Args:
+        recorded: the problem without the samples that the fit left out.
+        fitted: the same with the states that the fit says.
+        doubted: whether logs disagree, or the residuals are not noise.
+    """
+
+    recorded: Problem
+    fitted: Problem
     fit: Outcome[Fit]
     alone: LogEstimates
     conflict: Disagreement | None
@@ -142,7 +148,7 @@ class _Answers:
     place: Place
     bands: dict[str, tuple[FloatArray, FloatArray]]
     dead: dict[str, list[tuple[float, float]]]
-    doubted: bool  # whether logs disagree, or the residuals are not noise
+    doubted: bool
 
 
 def _checked(problem: Problem, method: Estimator, first: Calibration, checks: Checks, guard: Guard) -> _Answers:
@@ -168,16 +174,16 @@ def _checked(problem: Problem, method: Estimator, first: Calibration, checks: Ch
     doubted = conflict is not None or (lacks.misfit is not None and lacks.misfit.alarm)
     predictions = check(Check.PREDICTIONS, lambda: Predictions.of(fitted, theta.value, checks))
     compared = check(Check.COMPARISON, lambda: predictions.value.compared(checks)).otherwise(Compared())
-    place = check(Check.PRIOR, lambda: place_in_prior(fitted, method, fit.value, predictions.value, checks))
+    place = check(Check.PRIOR, lambda: place_in_prior(fitted, method, fit.value, predictions.value, checks)).otherwise(
+        Place()
+    )
     bands = check(
         Check.BANDS,
         lambda: predictions.value.bands(posterior, lacks.physics(space) if doubted else None, seed, checks),
-    )
-    dead = check(Check.RANGES, lambda: ranges_that_change_nothing(fit.value, checks))
-    empty = Place(())
+    ).otherwise({})
+    dead = check(Check.RANGES, lambda: ranges_that_change_nothing(fit.value, checks)).otherwise({})
     return _Answers(
-        *(own.train, fit, alone, conflict, lacks, further, predictions, compared),
-        *(place.otherwise(empty), bands.otherwise({}), dead.otherwise({}), doubted),
+        own, fitted, fit, alone, conflict, lacks, further, predictions, compared, place, bands, dead, doubted
     )
 
 
@@ -236,19 +242,21 @@ def _looks(
     drifts = {} if Findings(lacks.findings).of(Code.NOISE_FREE) else result.noise
     asked = lacks.misfit is not None and not grows(answers.fit.value.windows)
     return {
-        "alarms": lambda: [look.finding for look in (*place.logs, lacks.misfit) if look is not None and look.alarm],
-        "diagnostics of the problem": lambda: problem.findings,
+        "alarms": lambda: [
+            *(look.finding for look in (*place.logs, lacks.misfit) if look is not None and look.alarm),
+            *problem.findings,
+        ],
         "unmeasured starts": lambda: unmeasured_starts(
-            problem.simulator, answers.logs, problem.likelihood, problem.holdout is not None
+            problem.simulator, answers.recorded.train, problem.likelihood, problem.holdout is not None
         ),
         "diagnostics of the estimator": lambda: _own(method, asked),
         "rigid bodies": lambda: no_rigid_bodies(problem.environment, result.posterior, method.seed),
-        "logs without an estimate": lambda: [
-            finding(Code.AGREEMENT_UNKNOWN, log=name) for name in answers.alone.skipped
+        "diagnostics of the checks": lambda: [
+            *(finding(Code.AGREEMENT_UNKNOWN, log=name) for name in answers.alone.skipped),
+            *lacks.findings,
+            *place.findings,
         ],
-        "diagnostics of what the model lacks": lambda: lacks.findings,
         "drifting noise": lambda: drifting(drifts),
-        "diagnostics of the prior": lambda: place.findings,
         "uneven targets": lambda: uneven_targets(problem.environment),
         "disagreement": lambda: [] if answers.conflict is None else [answers.conflict.finding],
         "worth measuring": lambda: marginals.value.worth_measuring(),
@@ -256,7 +264,7 @@ def _looks(
         "bounds and contraction": lambda: marginals.value.findings(answers.dead, wider),
         "errors that grew": lambda: compared.findings(result.holdout),
         "logs as read": lambda: of_logs(problem.reports),
-        "process noise": lambda: _left_out(problem, method),
+        "process noise": lambda: _left_out(answers.fitted, method),
     }
 
 

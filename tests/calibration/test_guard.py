@@ -37,9 +37,8 @@ CHECKS = [
     *(check.value for check in Check),
     *("agreement of the logs", "intervals with what the model lacks", "summaries with what the model lacks", "ridges"),
     *("noise of the channels", "mixing of the chains", "coverage of the bands", "signals"),
-    *("samples left out of each log", "alarms", "diagnostics of the problem", "unmeasured starts"),
-    *("diagnostics of the estimator", "rigid bodies", "logs without an estimate"),
-    *("diagnostics of what the model lacks", "drifting noise", "diagnostics of the prior", "uneven targets"),
+    *("samples left out of each log", "alarms", "unmeasured starts"),
+    *("diagnostics of the estimator", "rigid bodies", "diagnostics of the checks", "drifting noise", "uneven targets"),
     *("disagreement", "worth measuring", "ridges to resolve", "bounds and contraction", "errors that grew"),
     *("logs as read", "process noise"),
 ]

@@ -109,7 +109,7 @@ def every_channel(problem: Problem, logs: Trajectories) -> Windows:
 class Place:
     """Of each log its place among simulations of the prior; findings of why that is unknown."""
 
-    logs: tuple[OutsidePrior, ...]
+    logs: tuple[OutsidePrior, ...] = ()
     findings: tuple[Finding, ...] = ()
 
 
