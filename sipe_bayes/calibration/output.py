@@ -25,7 +25,7 @@ from sipe_bayes.core.files import (
     write_bytes,
     write_text,
 )
-from sipe_bayes.core.findings import Code, finding
+from sipe_bayes.core.findings import Code, Finding, Guard, NotMade, finding
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.envs.export import ExportError, write_identified
 from sipe_bayes.envs.randomization_code import write_randomization
@@ -131,18 +131,44 @@ def write_all(calibration: Calibration, problem: Problem, folder: Path) -> Calib
     Returns:
         The result with what was noticed on the way.
     """
-    save_posterior(calibration.posterior, folder)
+    guard = Guard()
+    write_fit(calibration, folder, guard)
+    noticed = guard.run("identified model", lambda: _write_model(calibration, problem, folder)).otherwise([])
+    whole = replace(calibration, findings=(*calibration.findings, *noticed))
+    guard.run("randomization", lambda: _write_randomization(recommended(whole), problem, folder))
+    clip = guard.run("moving picture", lambda: _clip(whole, problem)).otherwise(None)
+    guard.run("report", lambda: write_report(whole, folder, clip, guard))
+    whole = replace(whole, findings=(*whole.findings, *guard.findings))
+    _write_result(whole, folder, guard)
+    write_text(folder / RUN, to_json({**whole.run, "status": "complete"}, indent=2))
+    return whole
+
+
+def write_fit(calibration: Calibration, folder: Path, guard: Guard) -> None:
+    """Write the posterior and ``result.json``, each whole or not at all; either is written without the other."""
+    guard.run("posterior", lambda: calibration.posterior.save(folder / "posterior"))
+    guard.run("draws of the posterior", lambda: _write_draws(calibration.posterior, folder))
+    _write_result(replace(calibration, findings=(*calibration.findings, *guard.findings)), folder, guard)
+
+
+def _write_result(calibration: Calibration, folder: Path, guard: Guard) -> None:
+    """Write ``result.json``, with mean and covariance of theta where no parameter could be summarised."""
+    plain, posterior = calibration.to_dict(), calibration.posterior
+    if not calibration.parameters:
+        of_theta = {"mean": lambda: posterior.mean.tolist(), "covariance": lambda: posterior.covariance.tolist()}
+        plain |= {f"theta_{key}": guard.run(key, make).otherwise(None) for key, make in of_theta.items()}
+    write_text(folder / "result.json", to_json(plain, indent=2))
+
+
+def _write_model(calibration: Calibration, problem: Problem, folder: Path) -> list[Finding]:
+    """Write the identified model; what of it could not be written."""
+    if not calibration.parameters:
+        raise NotMade
     values = np.array([p.mode for p in calibration.parameters])
     try:
-        noticed = write_identified(problem.environment, values, folder / "identified.xml")
+        return list(write_identified(problem.environment, values, folder / "identified.xml"))
     except ExportError as error:
-        noticed = [finding(Code.NOT_EXPORTED, reason=error)]
-    calibration = replace(calibration, findings=(*calibration.findings, *noticed))
-    _write_randomization(recommended(calibration), problem, folder)
-    write_report(calibration, folder, _clip(calibration, problem))
-    write_text(folder / "result.json", to_json(calibration.to_dict(), indent=2))
-    write_text(folder / RUN, to_json({**calibration.run, "status": "complete"}, indent=2))
-    return calibration
+        return [finding(Code.NOT_EXPORTED, reason=error)]
 
 
 def _clip(calibration: Calibration, problem: Problem) -> Clip:
@@ -164,11 +190,17 @@ def _clip(calibration: Calibration, problem: Problem) -> Clip:
 def save_posterior(posterior: Posterior, folder: Path) -> None:
     """Write ``posterior.*``: what ``load_posterior`` reads, and draws for ArviZ, the same each time."""
     posterior.save(folder / "posterior")
+    _write_draws(posterior, folder)
+
+
+def _write_draws(posterior: Posterior, folder: Path) -> None:
     write_bytes(folder / "posterior.nc", posterior.netcdf(torch.Generator().manual_seed(0)))
 
 
 def _write_randomization(drawn: Recommended, problem: Problem, folder: Path) -> None:
     """What policies are trained under, as a file, as generated code, and where it is another one as a posterior."""
+    if not drawn.bases:
+        raise NotMade
     saved = "posterior"
     if not drawn.plain:
         saved = RANDOMIZATION_POSTERIOR

@@ -26,6 +26,7 @@ from sipe_bayes.cli import video as video_commands
 from sipe_bayes.cli.check import SimulatedOn
 from sipe_bayes.cli.errors import (
     INTERRUPTED,
+    NOTHING_USABLE,
     check_least,
     check_words,
     exit_code_of,
@@ -130,16 +131,22 @@ def calibrate(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
     threads: Annotated[int | None, typer.Option(help="Native threads; default all cores.")] = None,
     device: SimulatedOn = "cpu",
+    time_limit: Annotated[
+        float | None,
+        typer.Option(help="Seconds; then the search ends with its best estimate, and checks are skipped."),
+    ] = None,
 ) -> None:
-    """Posterior of a simulator's parameters from logs of the real machine."""
+    """Posterior of a simulator's parameters from logs; exit code 3 where no value may be used within its interval."""
     from sipe_bayes.calibration.discover import run_discovery
     from sipe_bayes.calibration.run import run
     from sipe_bayes.core.files import to_json
+    from sipe_bayes.report.verdicts import doubt
 
     with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json) as progress:
         check_least(0, seed=seed)
         check_least(1, budget=budget, threads=threads)
-        calibration = run(config, estimator, seed, budget, out, threads, progress, device, _say_early)
+        check_least(0, time_limit=time_limit)
+        calibration = run(config, estimator, seed, budget, out, threads, progress, device, _say_early, time_limit)
     discovery = None
     if discover:
         with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json, counted=False) as progress:
@@ -148,10 +155,12 @@ def calibrate(
             discovery = run_discovery(config, folder, seed, num_threads=threads, progress=paced)
     if as_json:
         print(to_json(calibration.to_dict() | ({} if discovery is None else {"discovery": discovery.to_dict()})))
-        return
-    print_calibration(calibration)
-    if discovery is not None:
-        discover_commands.print_discovery(discovery)
+    else:
+        print_calibration(calibration)
+        if discovery is not None:
+            discover_commands.print_discovery(discovery)
+    if doubt(calibration) is not None:
+        raise typer.Exit(NOTHING_USABLE)
 
 
 def envs(

@@ -12,11 +12,13 @@ from contextlib import contextmanager
 import typer
 
 from sipe_bayes.cli.surroundings import broken_import, drop_output
-from sipe_bayes.core.files import FULL, printed, reason
+from sipe_bayes.core.files import FULL, printed, reason, was_interruption
 from sipe_bayes.core.validation import MOST, MOST_ROLLOUTS, most_threads
 
 BAD_INPUT = 2
 """Exit code where input is at fault."""
+NOTHING_USABLE = 3
+"""Exit code of a calibration that ended, but none of whose values may be used within their intervals."""
 _LONGEST = 1000  # characters of a word of the command line
 _announced: list[str] = []  # interruptions that the command itself put into words
 INTERRUPTED = 130  # exit code, as shells have it for SIGINT
@@ -78,14 +80,6 @@ def exit_code_of(error: Exception) -> int | None:
         return 1
     print(f"sipe: standard output: {os.strerror(error.errno or 0).lower()}; free some space there", file=sys.stderr)
     return BAD_INPUT
-
-
-def was_interruption(error: BaseException) -> bool:
-    """Whether an exception is what a library made of an interruption, as native modules do while they are imported."""
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, KeyboardInterrupt):
-        cause = cause.__cause__ or cause.__context__
-    return cause is not None
 
 
 def say_interrupted(then: str) -> None:

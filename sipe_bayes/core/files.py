@@ -88,6 +88,14 @@ def no_room(error: BaseException) -> OSError | None:
     return None
 
 
+def was_interruption(error: BaseException) -> bool:
+    """Whether an exception is what a library made of an interruption, as native modules do while they are imported."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__cause__ or cause.__context__
+    return cause is not None
+
+
 @contextmanager
 def scratch() -> Iterator[Path]:
     """A folder that is gone at the end; OSError where none can be written, which tempfile says in its own way."""

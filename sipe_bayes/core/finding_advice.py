@@ -23,6 +23,14 @@ ADVICE: dict[Code, str] = {
         "Give a larger `budget`: the same command in the same folder goes on with laplace; give other methods another "
         "`--out`."
     ),
+    Code.TIME_LIMIT: (
+        "The same command without `--time-limit`, or with a longer one, resumes: the limit is no part of the run."
+    ),
+    Code.INTERNAL_ERROR: (
+        "Estimates and intervals are those of the fit. Report the name of the check and the error; the same command "
+        "makes the check again."
+    ),
+    Code.CHECKS_SKIPPED: "Run the same command again: it makes the checks that are missing.",
     Code.AT_BOUND: _BOUNDS,
     Code.NOT_MIXED: (
         "The chains have not forgotten where they began. Raise the budget; fewer free parameters or a parameter "

@@ -60,6 +60,14 @@ class Code(Enum):
         "the budget of {budget} rollouts ran out before the method had converged: give a larger one; laplace "
         "goes on with it in the same folder"
     )
+    TIME_LIMIT = blocking(
+        "The time limit of {seconds:g} s ended the search before it had converged. Run again without a limit to resume"
+    )
+    INTERNAL_ERROR = caution(
+        "The check {check!r} ended with an internal error ({error}, {place}). The fit is not affected; the results of "
+        "this check are missing. Please report it"
+    )
+    CHECKS_SKIPPED = caution("These checks were skipped, because {reason}: {checks}")
     AT_BOUND = caution("{parameters} at a bound: the truth may lie beyond; widen the bounds, or look at the residuals")
     NOT_MIXED = blocking(
         "the {what} have not mixed (R-hat {rhat:.3f}, {ess:.0f} effective{unit}): {remedy} before you trust the "
@@ -90,9 +98,7 @@ class Code(Enum):
     DIVERGED_COUNT_AS_WORST = caution(
         "{count} of {total} simulations {failure} and counted as worst; narrow the bounds if they are many"
     )
-    SEARCH_STILL_WIDE = caution(
-        "the search is still wide (sd {sd:.2f} of the bounds' range): raise the budget, or expect nothing of it"
-    )
+    SEARCH_STILL_WIDE = caution("the search is still wide (sd {sd:.2f} of the bounds' range): raise the budget")
     BEST_AT_BOUND = caution("the best point has {parameters} at a bound: the truth may lie beyond it; widen the bounds")
     OTHER_TRAJECTORIES = blocking("the costs are those of other trajectories than these: the posterior is theirs")
     STARTS_NOT_RECORDED = blocking(
@@ -135,9 +141,7 @@ class Code(Enum):
     # laplace
     DIVERGES_AS_GIVEN = caution("the model as given diverges on these logs; the search started elsewhere")
     SEPARATE_OPTIMA = caution("the search found {count} separate optima; the posterior is a mixture of them")
-    PROCESS_NOISE_UNSETTLED = blocking(
-        "the process noise had not settled: do not rely on the intervals; more restarts may help"
-    )
+    PROCESS_NOISE_UNSETTLED = blocking("the process noise has not converged: do not rely on the intervals")
     NOT_THE_NORMAL = blocking(
         "around the optimum the likelihood is not the normal that the intervals are taken from (Pareto k = {k:.1f}, "
         "{effective:.0f} of {draws} draws effective), as in a wrong valley between contacts: do not rely on the "
@@ -380,9 +384,7 @@ class Code(Enum):
         "the log's {differs} differ from those that the simulations replayed: the posterior is that of another "
         "experiment; fit again with this log"
     )
-    UNLIKE_SIMULATIONS = blocking(
-        "the log is unlike every simulation ({p}): widen the bounds, or correct the model, before you trust the result"
-    )
+    UNLIKE_SIMULATIONS = blocking("the log is unlike every simulation ({p}): widen the bounds or correct the model")
     TRAINED_ANEW = note("the log's {differs} differ from those that were learned for: simulated and trained anew")
     ROUNDED_OUTPUTS = caution("x{outputs} vary by {sd:.0e} only, as rounding does; give fn's outputs in smaller units")
     FEW_DIFFERENT_PROPOSALS = caution(

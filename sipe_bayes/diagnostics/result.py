@@ -112,6 +112,7 @@ class Calibration:
         rollouts: spent.
         seconds: taken.
         out: folder that holds the results.
+        checked: False as long as the checks of the fit have not been made.
     """
 
     name: str
@@ -139,6 +140,7 @@ class Calibration:
     rollouts: int = 0
     seconds: float = 0.0
     out: str = ""
+    checked: bool = True
 
     def _repr_html_(self) -> str:
         rows = [
@@ -214,4 +216,5 @@ class Calibration:
             "rollouts": self.rollouts,
             "seconds": round(self.seconds, 3),
             "out": self.out,
+            "checked": self.checked,
         }

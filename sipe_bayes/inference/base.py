@@ -1,7 +1,6 @@
 """The Estimator contract: ``posterior = Estimator(simulator, budget=..., seed=...).fit(trajectories)``.
 
-A budget counts rollouts: one theta simulated over the horizon of one recorded log, however the log is cut into
-windows; finite differences count.
+A budget counts rollouts: one theta simulated over the horizon of one recorded log; finite differences count.
 """
 
 from __future__ import annotations
@@ -11,8 +10,10 @@ import hashlib
 import inspect
 import json
 import math
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +23,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import SearchState, Snapshot, Stored, load_state
-from sipe_bayes.core.findings import Code, Findings, Severity, finding
+from sipe_bayes.core.findings import Code, Findings, finding
 from sipe_bayes.core.options import Options
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import MOST_ROLLOUTS, flag, path, whole
@@ -131,6 +132,7 @@ class Estimator(ABC, Generic[S]):
     default_budget: ClassVar[int] = 1000
     goes_on: ClassVar[bool] = False
     checkpoint_seconds: float = 1.0
+    time_limit: float = math.inf  # s, after which a fit ends with its best estimate; no part of what a run is
     options_type: ClassVar[type[Options]] = Options
     state_type: ClassVar[type[SearchState]]  # the frozen dataclass of a method's state
     options: Options
@@ -203,8 +205,7 @@ class Estimator(ABC, Generic[S]):
 
         Args:
             trajectories: one or several, or an environment, which stands for its reference demonstrations.
-            retrain: begin from nothing: an amortised method forgets what it learned in earlier fits, and any method
-                replaces its checkpoint. Methods that learn nothing that lasts begin from nothing in every fit.
+            retrain: begin from nothing: an amortised method forgets what it learned, and the checkpoint is replaced.
 
         Returns:
             The posterior given them.
@@ -214,7 +215,7 @@ class Estimator(ABC, Generic[S]):
             BudgetTooSmall: for a budget without an estimate.
             CheckpointError: for a checkpoint that is damaged or of another run.
         """
-        batch = self._given.stack(self._recorded(trajectories), anew=True)
+        batch, ends = self._given.stack(self._recorded(trajectories), anew=True), time.monotonic() + self.time_limit
         self.budget = self.budget_for(batch) if self._own_budget else self.budget
         fingerprint = self._fingerprint(batch)
         self.findings, self.diagnostics, self.rollouts, self._bound = Findings(), {}, 0, None
@@ -229,6 +230,12 @@ class Estimator(ABC, Generic[S]):
                 last = self._keep(self.step(last.state, batch))
                 stored.offer(last, last.state.done, self._bound is not None and self._bound[1].short)
                 self.tell(self.describe(last.state), self.rollouts)
+                if time.monotonic() > ends and not last.state.done:
+                    with suppress(BudgetTooSmall):  # there is no estimate yet
+                        posterior = self._finished(last.state, batch)
+                        stored.write()
+                        self.find(Code.TIME_LIMIT, seconds=self.time_limit)
+                        return posterior
         except BudgetExhausted:
             stored.write()
             self.find(Code.BUDGET_SPENT, budget=self.budget)
@@ -298,9 +305,8 @@ class Estimator(ABC, Generic[S]):
 
     def _recorded(self, given: Recorded) -> Any:
         """``given``, or the trajectory that an observed x (D,) of a CallableSimulator stands for."""
-        if not isinstance(self.simulator, CallableSimulator) or isinstance(given, Trajectory | Trajectories):
-            return given
-        if isinstance(given, list | tuple) and given and isinstance(given[0], Trajectory):
+        several = isinstance(given, list | tuple) and given and isinstance(given[0], Trajectory)
+        if several or not isinstance(self.simulator, CallableSimulator) or isinstance(given, Trajectory | Trajectories):
             return given
         made = self.simulator.trajectory(given)
         if self._observed is None or not np.array_equal(made.observations, self._observed.observations, equal_nan=True):
@@ -335,17 +341,9 @@ class Estimator(ABC, Generic[S]):
         self._last, self.rollouts, self.findings = last, last.rollouts, Findings(last.findings)
         self.diagnostics = json.loads(last.diagnostics)
 
-    def find(
-        self,
-        code: Code,
-        *,
-        parameters: Iterable[str] = (),
-        log: str | None = None,
-        severity: Severity | None = None,
-        **values: object,
-    ) -> None:
+    def find(self, code: Code, *, parameters: Iterable[str] = (), log: str | None = None, **values: object) -> None:
         """Note a finding, once; as of ``core.findings.finding``."""
-        self.findings.add(finding(code, parameters=parameters, log=log, severity=severity, **values))
+        self.findings.add(finding(code, parameters=parameters, log=log, severity=None, **values))
 
     @property
     def warnings(self) -> list[str]:

@@ -36,11 +36,11 @@ class ProgressBar:
         self._bar: Any = None
         self._unit, self._counted = unit, counted
         self._began = self._last = time.monotonic()
-        self._first, self._before = 0, (0, 0)  # what was done when this count began; and last, of how much
+        self._first = self._before = 0  # what was done when this count began, and last
         self._since: float | None = None  # when it began
         seen = "ipykernel" in sys.modules or sys.stderr.isatty()
         self._lines = not quiet and not seen
-        self._latest: tuple[str, int, int, int | None] | None = None
+        self._latest: tuple[str, int, int] | None = None
         self._lock, self._over = threading.Lock(), threading.Event()
         self._beat: threading.Thread | None = None
         if not quiet and seen:
@@ -68,26 +68,24 @@ class ProgressBar:
             self._bar.close()
             self._bar = None
 
-    def __call__(self, what: str, done: int, total: int, usual: int | None = None) -> None:
+    def __call__(self, what: str, done: int, total: int) -> None:
         """Say what is being done, and how much of all is done.
 
         Args:
             what: is being done.
             done: of the total.
-            total: the most that may be needed.
-            usual: what is needed as a rule, by which the rest is foretold; default the total.
+            total: what is done and what is still expected.
         """
         if self._bar is not None:
             self._bar.set_description(what, refresh=False)
-            shown = total if usual is None else min(max(usual, done), total)
-            self._bar.total, self._bar.n = shown, min(done, shown)
+            self._bar.total, self._bar.n = total, min(done, total)
             self._bar.refresh()
         elif self._lines:
-            self._latest = what, done, total, usual
+            self._latest = what, done, total
             if self._beat is None and not self._over.is_set():
                 self._beat = threading.Thread(target=self._go_on, daemon=True)
                 self._beat.start()
-            self._print(what, done, total, usual)
+            self._print(what, done, total)
 
     def _go_on(self) -> None:
         """Say again what is being done, until the end."""
@@ -95,35 +93,27 @@ class ProgressBar:
             assert self._latest is not None
             self._print(*self._latest)
 
-    def _print(self, what: str, done: int, total: int, usual: int | None) -> None:
+    def _print(self, what: str, done: int, total: int) -> None:
+        """Print a line where one is due."""
         with self._lock:
-            self._print_line(what, done, total, usual)
+            now = time.monotonic()
+            if self._since is None or done < self._before:  # another count
+                self._first, self._since = done, now
+            self._before = done
+            if now - self._last >= _SECONDS:
+                self._last = now
+                print(self._line(what, done, total), file=sys.stderr, flush=True)
 
-    def _print_line(self, what: str, done: int, total: int, usual: int | None) -> None:
-        now = time.monotonic()
-        other = done < self._before[0] or (usual is None and total != self._before[1])
-        if self._since is None or other:  # another count
-            self._first, self._since = done, now
-        self._before = (done, total)
-        if now - self._last >= _SECONDS:
-            self._last = now
-            print(self._line(what, done, total, usual), file=sys.stderr, flush=True)
-
-    def _line(self, what: str, done: int, total: int, usual: int | None) -> str:
-        """The time until now, what is being done, and unless all is done how far and how long the rest may take."""
+    def _line(self, what: str, done: int, total: int) -> str:
+        """The time until now, what is being done, how much, and how long the rest takes at the speed until now."""
         line = f"{self._last - self._began:.0f} s: {what}"
         if done >= total or not self._counted:
             return line
-        expected = total if usual is None else min(usual, total)
-        if done >= expected:
-            return f"{line}; {done} of at most {total} {self._unit}, more than usual"
-        most = expected == total
-        line += f"; {done} of {'at most' if most else 'about'} {expected} {self._unit}"
+        line += f"; {done} of about {total} {self._unit}"
         own = done - self._first  # not what an earlier run did
-        if own:
-            seconds = (self._last - (self._since or self._last)) * (expected - done) / own
-            line += f", about {_spoken(seconds)} for the rest" + " if all are needed" * most
-        return line if most else f"{line} (at most {total})"
+        if not own:
+            return line
+        return f"{line}, about {_spoken((self._last - (self._since or 0.0)) * (total - done) / own)} left"
 
 
 def _spoken(seconds: float) -> str:

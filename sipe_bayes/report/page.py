@@ -11,15 +11,17 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from sipe_bayes.core.files import write_bytes
 from sipe_bayes.core.finding_advice import ADVICE
-from sipe_bayes.core.findings import Code, Finding, Findings, Severity
+from sipe_bayes.core.findings import Code, Finding, Findings, Guard, Severity
 from sipe_bayes.core.html import Page
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.thresholds import THRESHOLDS
@@ -181,22 +183,28 @@ def _logs(calibration: Calibration) -> list[tuple[str, str]]:
 
 
 @uncollected()
-def pictures(calibration: Calibration) -> list[Picture]:
-    """Every figure of the report, rendered."""
-    drawn = [("marginals", "marginals", "Marginal of each parameter", plots.marginals(calibration))]
-    drawn.append(("pairs", "pairs", "Pairs of parameters", plots.pairs(calibration)))
+def pictures(calibration: Calibration, guard: Guard) -> list[Picture]:
+    """Every figure of the report, rendered; one that raises is left out."""
+    drawn: list[tuple[str, str, str, Callable[[], list[Figure]]]] = [
+        ("marginals", "marginals", "Marginal of each parameter", lambda: plots.marginals(calibration)),
+        ("pairs", "pairs", "Pairs of parameters", lambda: plots.pairs(calibration)),
+    ]
     logs = _logs(calibration)
     shown = {log for log, _ in logs}
     for i, (log, use) in enumerate(logs):
         slug = re.sub(r"[^A-Za-z0-9]+", "_", log).strip("_")[:40]
         alt = f"Measured and simulated signals of {log}"
-        drawn.append((f"signals_{use}", f"signals_{i + 1}_{slug}", alt, plots.signals(calibration, log)))
+        drawn.append((f"signals_{use}", f"signals_{i + 1}_{slug}", alt, partial(plots.signals, calibration, log)))
     fitted = replace(calibration, residuals=[row for row in calibration.residuals if row.log in shown])
-    drawn.append(("residuals", "residuals", "Residuals and their autocorrelation", plots.residuals(fitted)))
-    drawn.append(("chains", "chains", "Traces of the Markov chains", plots.chains(calibration)))
+    drawn.append(("residuals", "residuals", "Residuals and their autocorrelation", lambda: plots.residuals(fitted)))
+    drawn.append(("chains", "chains", "Traces of the Markov chains", lambda: plots.chains(calibration)))
+    return [image for one in drawn for image in guard.run(f"figure {one[1]}", partial(_rendered, *one)).otherwise([])]
+
+
+def _rendered(section: str, file: str, alt: str, draw: Callable[[], list[Figure]]) -> list[Picture]:
+    figures = draw()
     return [
         Picture(section, f"{file}{f'_{k + 1}' if len(figures) > 1 else ''}.png", png(figure), alt)
-        for section, file, alt, figures in drawn
         for k, figure in enumerate(figures)
     ]
 
@@ -267,7 +275,9 @@ def render(calibration: Calibration, images: Sequence[Picture], clip: Clip | Non
 
 def page(calibration: Calibration) -> Page:
     """The page, with its figures inside."""
-    return Page(render(calibration, pictures(calibration)))
+    guard = Guard()
+    images = pictures(calibration, guard)
+    return Page(render(_with(calibration, guard), images))
 
 
 def write_pictures(images: Sequence[Picture], folder: str | os.PathLike[str]) -> None:
@@ -278,19 +288,34 @@ def write_pictures(images: Sequence[Picture], folder: str | os.PathLike[str]) ->
         write_bytes(figures / image.file, image.content)
 
 
-def write_report(calibration: Calibration, folder: str | os.PathLike[str], clip: Clip | None = None) -> Path:
+def write_report(
+    calibration: Calibration, folder: str | os.PathLike[str], clip: Clip | None = None, guard: Guard | None = None
+) -> Path:
     """Write ``figures/*.png`` and ``report.html``; everything is drawn and rendered before the first file is written.
+
+    Figures that raise are left out; where the page does, estimates and diagnostics are written in its place.
 
     Args:
         calibration: the result.
         folder: where to.
         clip: the machine as measured and as simulated, or why there is none.
+        guard: is told of what could not be drawn.
 
     Returns:
         The report's path.
     """
-    images = pictures(calibration)
-    return write_page(render(calibration, images, clip), images, folder)
+    guard = guard or Guard()
+    images = pictures(calibration, guard)
+    whole = _with(calibration, guard)
+    page = guard.run("page of the report", lambda: render(whole, images, clip)).made
+    for image in images:
+        guard.run(f"file {image.file}", partial(write_pictures, [image], folder))
+    return write_page(page[0] if page else f"<!DOCTYPE html>{_with(calibration, guard)._repr_html_()}", [], folder)
+
+
+def _with(calibration: Calibration, guard: Guard) -> Calibration:
+    """The calibration with the diagnostics of what could not be drawn."""
+    return replace(calibration, findings=(*calibration.findings, *guard.findings))
 
 
 def write_page(text: str, images: Sequence[Picture], folder: str | os.PathLike[str]) -> Path:

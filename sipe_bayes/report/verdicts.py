@@ -128,6 +128,8 @@ def _doubts(findings: Findings, parameters: Sequence[ParameterSummary]) -> list[
 
 def doubt(calibration: Calibration) -> str | None:
     """Why no value may be used within any of its intervals, the first reason; None where some may."""
+    if not calibration.parameters:
+        return "the posterior could not be summarised"
     doubts = _doubts(Findings(calibration.findings), calibration.parameters)
     mixing = mixing_verdict(calibration)
     if not doubts and mixing is not None and mixing.tone == "bad":
@@ -182,6 +184,10 @@ def headline(
         better: False where held-out logs show it worse than the model as given, or not better.
     """
     wanted = [p for p in parameters if not p.nuisance]
+    if not parameters:
+        return Verdict(
+            "bad", "The posterior could not be summarised: result.json holds the mean of theta, if there is one."
+        )
     if not wanted:
         return Verdict("fair", "Only nuisance parameters were estimated.")
     doubts = _doubts(findings, wanted)
@@ -197,7 +203,7 @@ def headline(
     good = [p for p in wanted if _of_the_logs(p, findings).tone == "good"]
     if not good:
         return Verdict("bad", "No value may be trusted within its interval; the table says why.")
-    unasked = bool(findings.of(Code.MISFIT_NOT_ASKED, Code.WINDOWS_NOT_FOLLOWED))
+    unasked = bool(findings.of(Code.MISFIT_NOT_ASKED, Code.MISFIT_UNKNOWN, Code.WINDOWS_NOT_FOLLOWED))
     hanging = [p.name for p in good if _hangs(p, findings)]
     conditions = ["if the model lacks nothing"] if unasked else []
     if hanging:
@@ -337,6 +343,8 @@ def verdicts(calibration: Calibration, brief: bool = False) -> list[Verdict]:
     """
     findings = Findings(calibration.findings)
     predicted = prediction(calibration.holdout, calibration.comparison)
+    if not calibration.train and findings.of(Code.INTERNAL_ERROR, Code.CHECKS_SKIPPED):
+        predicted = Verdict("fair", "The logs were not predicted: a warning says why. The errors are unknown.")
     better = predicted.tone != "bad"
     first = [headline(calibration.parameters, findings, calibration.bands, brief, better), predicted]
     if not better:

@@ -25,6 +25,7 @@ MOST_STEPS = 10_000
 class Simulated:
     """An environment, compiled; see ``Simulator``, which is what it is made for."""
 
+    total_steps: ClassVar[int] = 0  # control steps of all rollouts of this process, whichever simulator's
     failure: ClassVar[str] = "diverged"  # what is said of simulations that are not valid to their end
 
     def __init__(self, environment: Environment, num_threads: int | None = None, device: str = "cpu") -> None:

@@ -151,6 +151,7 @@ class Simulator(Simulated):
     def count(self, steps: int, diverged: int) -> None:
         """Count control steps and diverged simulations."""
         self.control_steps += steps
+        Simulated.total_steps += steps
         self.diverged += diverged
 
     def replay(self, theta: FloatArray, trajectories: Trajectories, starts: FloatArray | None = None) -> Trajectories:

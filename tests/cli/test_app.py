@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 import sipe_bayes as sipe
 from sipe_bayes.cli.app import app
+from sipe_bayes.cli.errors import NOTHING_USABLE
 from sipe_bayes.core.files import LOCK
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
 from sipe_bayes.posterior import load_posterior
@@ -214,7 +215,7 @@ def test_state_space_leaves_out_what_does_not_apply_and_says_so(tmp_path: Path, 
 def test_the_spread_of_a_search_is_not_trusted(tmp_path: Path, log: pd.DataFrame) -> None:
     config = write_case(tmp_path, log)
     result = call(config, "--estimator", "cem", "--budget", 200, "--out", tmp_path / "out")
-    assert result.exit_code == 0, result.stderr
+    assert result.exit_code == NOTHING_USABLE, result.stderr
     assert "interval yet: " in result.stdout
     assert "warning: the spread of cem" in " ".join(result.stdout.split())
     found = strict_json((tmp_path / "out" / "result.json").read_text())
@@ -314,9 +315,9 @@ def test_killed_run_resumes_to_the_same_posterior(tmp_path: Path, log: pd.DataFr
     finally:
         process.kill()
     resumed = call(*broken)  # with two threads
-    assert resumed.exit_code == 0, resumed.output
+    assert resumed.exit_code == NOTHING_USABLE, resumed.output  # the budget ended it
     undisturbed = CliRunner().invoke(app, ["calibrate", *map(str, whole)])
-    assert undisturbed.exit_code == 0, undisturbed.output
+    assert undisturbed.exit_code == NOTHING_USABLE, undisturbed.output
     assert (tmp_path / "broken" / "checkpoint.safetensors").stat().st_size > size
     for name in ("posterior.safetensors", "posterior.json", "identified.xml", "domain_randomization.json"):
         assert (tmp_path / "broken" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name

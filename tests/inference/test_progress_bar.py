@@ -57,8 +57,8 @@ def lines(monkeypatch: pytest.MonkeyPatch, quiet: bool = False, counted: bool = 
 
 
 def test_lines(monkeypatch: pytest.MonkeyPatch) -> None:
-    fit, checks = "16 s: step 40; 40 of at most 100 rollouts", "34 s: checking"
-    assert lines(monkeypatch) == [f"{fit}, about 24 s for the rest if all are needed", checks]
+    fit, checks = "16 s: step 40; 40 of about 100 rollouts", "34 s: checking"
+    assert lines(monkeypatch) == [f"{fit}, about 24 s left", checks]
     assert lines(monkeypatch, counted=False) == ["16 s: step 40", checks]
 
 
@@ -72,8 +72,8 @@ def test_a_count_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
             progress("fitting", done, total)
             clock.now += 15
     first, _, second = stream.getvalue().splitlines()
-    assert first.endswith("850 of at most 1000 rollouts, about 45 s for the rest if all are needed")
-    assert second.endswith("50 of at most 500 rollouts, about 2 min for the rest if all are needed")
+    assert first.endswith("850 of about 1000 rollouts, about 45 s left")
+    assert second.endswith("50 of about 500 rollouts, about 2 min left")
 
 
 def test_lines_come_while_nothing_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,10 +85,10 @@ def test_lines_come_while_nothing_is_reported(monkeypatch: pytest.MonkeyPatch) -
     with sipe.ProgressBar() as progress:
         progress("long work", 3, 8)
         deadline = time.monotonic() + 30
-        while stream.getvalue().count("long work; 3 of at most 8 rollouts") < 3 and time.monotonic() < deadline:
+        while stream.getvalue().count("long work; 3 of about 8 rollouts") < 3 and time.monotonic() < deadline:
             time.sleep(0.01)
     printed = stream.getvalue()
-    assert printed.count("long work; 3 of at most 8 rollouts") >= 3
+    assert printed.count("long work; 3 of about 8 rollouts") >= 3
     time.sleep(0.2)
     assert stream.getvalue() == printed
 
@@ -104,24 +104,15 @@ def test_notebook(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "start 1 of 3:  25%" in shown(monkeypatch, io.StringIO())
 
 
-def test_what_is_usual_is_foretold(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside the most that may be needed; and a total that shrinks between is the same count."""
+def test_a_total_that_shrinks_is_the_same_count(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, stream = Clock(), io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
     monkeypatch.setattr("sipe_bayes.inference.progress_bar.time", clock)
     with sipe.ProgressBar() as progress:
-        for done, total, usual in ((0, 1000, 300), (100, 1000, 300), (200, 500, 250), (260, 500, 250)):
-            progress("fitting", done, total, usual)
+        for done, total in ((0, 300), (100, 300), (200, 250), (250, 250)):
+            progress("fitting", done, total)
             clock.now += 15
     first, second, last = stream.getvalue().splitlines()
-    assert first.endswith("100 of about 300 rollouts, about 30 s for the rest (at most 1000)")
-    assert second.endswith("200 of about 250 rollouts, about 8 s for the rest (at most 500)")
-    assert last.endswith("260 of at most 500 rollouts, more than usual")
-
-
-def test_a_bar_is_full_where_what_is_usual_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
-    stream = Terminal()
-    monkeypatch.setattr(sys, "stderr", stream)
-    with sipe.ProgressBar() as progress:
-        progress("fitting", 20, 400, 80)
-    assert "20/80" in stream.getvalue()
+    assert first.endswith("100 of about 300 rollouts, about 30 s left")
+    assert second.endswith("200 of about 250 rollouts, about 8 s left")
+    assert last == "45 s: fitting"

@@ -11,7 +11,7 @@ import pytest
 
 from sipe_bayes.core import files
 from sipe_bayes.core.finding_advice import ADVICE
-from sipe_bayes.core.findings import Code, Severity
+from sipe_bayes.core.findings import Code, Guard, Severity
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.diagnostics.records import (
     ChannelNoise,
@@ -50,7 +50,7 @@ def calibration() -> Calibration:
 
 @pytest.fixture(scope="module")
 def images(calibration: Calibration) -> list[report.Picture]:
-    return report.pictures(calibration)
+    return report.pictures(calibration, Guard())
 
 
 @pytest.fixture(scope="module")
@@ -207,7 +207,7 @@ def test_notes_are_in_the_page_once(calibration: Calibration) -> None:
 
 
 def test_report_and_figures_are_written(tmp_path: Path, images: list[report.Picture], monkeypatch: Any) -> None:
-    monkeypatch.setattr(report, "pictures", lambda _: images)
+    monkeypatch.setattr(report, "pictures", lambda *_: images)
     path = report.write_report(make_calibration(), tmp_path / "new" / "run")
     assert path == tmp_path / "new" / "run" / "report.html"
     assert {p.name for p in path.parent.iterdir()} == {"report.html", "figures"}
@@ -222,16 +222,18 @@ def test_report_and_figures_are_written(tmp_path: Path, images: list[report.Pict
     assert all(p.read_bytes().startswith(b"\x89PNG") for p in (path.parent / "figures").iterdir())
 
 
-@pytest.mark.parametrize("part", ["render", "pictures"])
-def test_a_failure_leaves_nothing(part: str, tmp_path: Path, images: list[report.Picture], monkeypatch: Any) -> None:
+def test_a_page_that_fails_is_replaced_by_estimates_and_diagnostics(
+    tmp_path: Path, images: list[report.Picture], monkeypatch: Any
+) -> None:
     def fail(*_: Any) -> Any:
         raise RuntimeError("no ink")
 
-    monkeypatch.setattr(report, "pictures", lambda _: images)
-    monkeypatch.setattr(report, part, fail)
-    with pytest.raises(RuntimeError, match="no ink"):
-        report.write_report(make_calibration(), tmp_path)
-    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr(report, "pictures", lambda *_: images)
+    monkeypatch.setattr(report, "render", fail)
+    text = report.write_report(make_calibration(), tmp_path).read_text(encoding="utf-8")
+    assert "RuntimeError: no ink" in text
+    assert all(f"<td>{p.name}</td>" in text for p in make_calibration().parameters)
+    assert {p.name for p in (tmp_path / "figures").iterdir()} == {image.file for image in images}
 
 
 def test_an_interrupted_write_keeps_the_old_report(
@@ -245,7 +247,7 @@ def test_an_interrupted_write_keeps_the_old_report(
             raise OSError("disk full")
         replace(source, target)
 
-    monkeypatch.setattr(report, "pictures", lambda _: images)
+    monkeypatch.setattr(report, "pictures", lambda *_: images)
     monkeypatch.setattr(files.os, "replace", interrupted)
     with pytest.raises(OSError, match="disk full"):
         report.write_report(make_calibration(), tmp_path)

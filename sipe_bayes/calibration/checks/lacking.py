@@ -98,6 +98,11 @@ class Lacking:
         return MissingPhysics(further, self.missing.causes, self.missing.explained)
 
 
+NOTHING_ASKED = Lacking(
+    None, None, None, (), (finding(Code.MISFIT_UNKNOWN, reason="the check has no result, see the other warnings"),)
+)
+
+
 def lacking(
     problem: Problem,
     method: Estimator,

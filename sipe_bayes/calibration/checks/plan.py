@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
@@ -22,10 +21,10 @@ from sipe_bayes.inference.laplace.forecast import usual_rest, usual_rollouts
 from sipe_bayes.inference.laplace.windows.followed import followed_cost
 from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.inference.laplace.windows.state import WindowState
-from sipe_bayes.inference.progress_bar import ProgressBar
 from sipe_bayes.inference.recorded import Progress, Tell
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.simulation.base import Simulated
 from sipe_bayes.structure.probes import probes_cost
 
 S = TypeVar("S")
@@ -44,27 +43,9 @@ class Check(enum.Enum):
     RANGES = "where parameters change nothing"
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Rollouts of the checks.
-
-    Args:
-        most: those that each takes at most.
-        logs: those that what each log says by itself takes as a rule, where it takes any.
-    """
-
-    most: Mapping[Check, int] = field(default_factory=dict)
-    logs: int = 0
-
-    @property
-    def total(self) -> int:
-        """At most."""
-        return sum(self.most.values())
-
-    @property
-    def usual(self) -> int:
-        """As a rule."""
-        return self.total - self.most.get(Check.LOGS, 0) + self.logs
+Plan = Mapping[Check, int]
+"""Rollouts that each check takes, as far as can be said before the fit; linear algebra is in none."""
+NO_PLAN: Plan = {}
 
 
 class Checks:
@@ -74,7 +55,7 @@ class Checks:
         kept: keeps their results.
         progress: called along the way.
         spent: rollouts of the fit.
-        plan: rollouts of the checks.
+        plan: of the checks.
         simulated: counts the rollouts that were simulated until it is called.
     """
 
@@ -82,8 +63,7 @@ class Checks:
         self, kept: Kept, progress: Progress | None, spent: int, plan: Plan, simulated: Callable[[], float]
     ) -> None:
         self._kept, self._progress, self._plan = kept, progress, plan
-        self._done, self._usual, self._total = spent, spent + plan.usual, spent + plan.total
-        self._simulated, self._before = simulated, simulated()
+        self._simulated, self._fit = simulated, spent - simulated()
 
     def of(self, check: Check, kind: type[S], make: Callable[[Tell, Kept], S]) -> S:
         """The result of a check.
@@ -93,37 +73,30 @@ class Checks:
             kind: of the result, as ``Kept.of`` has it.
             make: called with what is told of its parts, and what keeps them.
         """
-        tell, began = partial(self._tell, check), False
 
         def work(kept: Kept) -> S:
-            nonlocal began
-            began, self._before = True, self._simulated()
+            tell = partial(self._tell, check, self._simulated())
             tell()
             return make(tell, kept)
 
-        result, most = self._kept.of(check.name.lower(), kind, work), self._plan.most.get(check, 0)
-        usual, taken = most, most if began else 0
-        if check is Check.LOGS:  # which takes all or next to nothing
-            usual, taken = self._plan.logs, self._taken(check) if began else 0
-        self._done += taken
-        self._usual += taken - usual
-        self._total += taken - most
-        return result
+        return self._kept.of(check.name.lower(), kind, work)
 
-    def _taken(self, check: Check) -> int:
-        """Rollouts of a check until now; about, where windows differ in length."""
-        return min(int(self._simulated() - self._before), self._plan.most.get(check, 0))
-
-    def _tell(self, check: Check, part: str = "") -> None:
+    def _tell(self, check: Check, before: float, part: str = "") -> None:
+        """Say how far a check is, what it needs by plan, and what those after it need."""
         if self._progress is not None:
-            what = f"check {list(Check).index(check) + 1} of {len(Check)}, {check.value}" + f": {part}" * bool(part)
-            _show(self._progress, what, self._done + self._taken(check), self._total, self._usual)
+            order, simulated = list(Check), self._simulated()
+            number = order.index(check)
+            rest = max(self._plan.get(check, 0) - (simulated - before), 0.0)
+            rest += sum(self._plan.get(later, 0) for later in order[number + 1 :])
+            what = f"check {number + 1} of {len(order)}, {check.value}" + f": {part}" * bool(part)
+            done = self._fit + simulated
+            self._progress(what, round(done), round(done + rest))
 
 
 def rollouts_of(problem: Problem) -> Callable[[], float]:
-    """A function that counts what the problem's simulator has simulated, in rollouts of a training log."""
+    """A function that counts what this process has simulated, extended models too, in rollouts of a training log."""
     steps = float(problem.train.length.mean())
-    return lambda: problem.simulator.control_steps / steps
+    return lambda: Simulated.total_steps / steps
 
 
 def plan_of(problem: Problem, method: Estimator) -> Plan:
@@ -143,9 +116,10 @@ def plan_of(problem: Problem, method: Estimator) -> Plan:
         lacking = 0 if chain else probes_cost(windows, np.clip(problem.environment.space.default_theta, 0, 1))
     except ValueError:  # the model as given diverges, which the check will say
         lacking = 0
-    most = {
+    alone = min(int(usual_rollouts(n + windows.num_start, logs)), LOG_BUDGET * logs)
+    return {
         Check.STARTS: 0 if known else 2 * search,
-        Check.LOGS: (0 if chain else lin) + LOG_BUDGET * logs if logs > 1 and not grows(windows) else 0,
+        Check.LOGS: (alone if chain else lin) if logs > 1 and not grows(windows) else 0,
         Check.LACKING: lacking if chain else lacking + (followed_cost(windows) if chosen else lin + logs),
         Check.PREDICTIONS: 2 * (logs + held),
         Check.COMPARISON: 2 * search * (logs + held) // logs,
@@ -153,8 +127,6 @@ def plan_of(problem: Problem, method: Estimator) -> Plan:
         Check.BANDS: band_cost(windows) * (logs + held) // logs,
         Check.RANGES: 2 * len(GRID) * n * logs,
     }
-    alone = int(usual_rollouts(n + windows.num_start, logs))
-    return Plan(most, min(alone, most[Check.LOGS]))
 
 
 def with_checks(progress: Progress, plan: Plan, method: Estimator, logs: int) -> Progress:
@@ -162,8 +134,8 @@ def with_checks(progress: Progress, plan: Plan, method: Estimator, logs: int) ->
 
     def of_fit(what: str, done: int, total: int) -> None:
         rest = _usual_rest(method, logs)
-        usual = None if rest is None else min(int(done + rest), total) + plan.usual
-        _show(progress, f"{what} (then checks)", done, total + plan.total, usual)
+        expected = total if rest is None else min(done + round(rest), max(total, done))
+        progress(f"{what} (then checks)", done, expected + sum(plan.values()))
 
     return of_fit
 
@@ -177,11 +149,3 @@ def _usual_rest(method: Estimator, logs: int) -> float | None:
         return None
     drawn = 0 if state.draws is None else len(state.draws.values)
     return usual_rest(state.search, drawn, state.search.points.shape[1] + method.num_start, logs)
-
-
-def _show(progress: Progress, what: str, done: int, total: int, usual: int | None) -> None:
-    """Tell what is usual to a bar, which takes it, beside what may be needed."""
-    if isinstance(progress, ProgressBar):
-        progress(what, done, total, usual)
-    else:
-        progress(what, done, total)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,24 +29,27 @@ from sipe_bayes.posterior import Posterior
 
 
 @dataclass(frozen=True)
-class _Compared:
+class Compared:
     """Held-out errors against those of the model as given, and training errors that grew."""
 
-    comparison: Comparison | None
-    worse: tuple[Finding, ...]
+    comparison: Comparison | None = None
+    worse: tuple[Finding, ...] = ()
+
+    def findings(self, holdout: Sequence[ChannelScore]) -> list[Finding]:
+        """Errors that grew: in training, and held out unless they are mostly those of the measured starts."""
+        of_starts = self.comparison is not None and self.comparison.starts is not None
+        return [*self.worse, *([] if of_starts else not_better(holdout))]
 
 
 @dataclass(frozen=True)
 class Predictions:
-    """Of the logs at theta (N,), by use: windows from measured starts, the errors there, the held-out ones compared."""
+    """Of the logs at theta (N,), by use: windows from measured starts, predicted (2, W, L, C), and the errors there."""
 
     theta: FloatArray
     windows: dict[str, Windows]
     predicted: dict[str, FloatArray]
     train: list[ChannelScore]
     holdout: list[ChannelScore]
-    comparison: Comparison | None
-    worse: tuple[Finding, ...]
 
     @classmethod
     def of(cls, problem: Problem, theta: FloatArray, checks: Checks) -> Predictions:
@@ -61,22 +64,21 @@ class Predictions:
         for use, one in windows.items():
             one.mask(wild_residuals(one, np.where(one.observed, one.measured - predicted[use][0], 0.0)))
         scores = {use: channel_scores(one, theta, predicted[use]) for use, one in windows.items()}
+        return cls(theta, windows, predicted, scores["train"], scores.get("holdout", []))
 
-        def compared(tell: Tell, kept: Kept) -> _Compared:
+    def compared(self, checks: Checks) -> Compared:
+        """The errors beside those of the model as given."""
+
+        def made(tell: Tell, kept: Kept) -> Compared:
             comparison = None
-            if "holdout" in windows:
+            if "holdout" in self.windows:
                 tell("held-out logs")
-                comparison = compare_errors(windows["holdout"], theta, predicted=predicted["holdout"])
+                held, predicted = self.windows["holdout"], self.predicted["holdout"]
+                comparison = compare_errors(held, self.theta, predicted=predicted)
             tell("training logs")
-            return _Compared(comparison, tuple(worse_in_training(windows["train"], theta, scores["train"])))
+            return Compared(comparison, tuple(worse_in_training(self.windows["train"], self.theta, self.train)))
 
-        both = checks.of(Check.COMPARISON, _Compared, compared)
-        return cls(theta, windows, predicted, scores["train"], scores.get("holdout", []), both.comparison, both.worse)
-
-    def findings(self) -> list[Finding]:
-        """Errors that became larger: in training, and held out unless they are mostly those of the measured starts."""
-        of_starts = self.comparison is not None and self.comparison.starts is not None
-        return [*self.worse, *([] if of_starts else not_better(self.holdout))]
+        return checks.of(Check.COMPARISON, Compared, made)
 
     def bands(
         self, posterior: Posterior, missing: MissingPhysics | None, seed: int, checks: Checks
@@ -90,10 +92,11 @@ class Predictions:
         return checks.of(Check.BANDS, dict[str, tuple[FloatArray, FloatArray]], made)
 
     def signals(self, bands: Mapping[str, tuple[FloatArray, FloatArray]]) -> list[Signal]:
-        """What the report draws, held-out logs first; the ends (W, L, C) of their bands by use."""
+        """What the report draws, held-out logs first; the ends (W, L, C) of their bands by use, if there are any."""
         drawn = []
         for use, windows in reversed(self.windows.items()):
-            drawn += signals(windows, use, self.predicted[use], bands[use])
+            none = np.full_like(self.predicted[use][0], np.nan)
+            drawn += signals(windows, use, self.predicted[use], bands.get(use, (none, none)))
         return drawn
 
 
@@ -106,7 +109,7 @@ def every_channel(problem: Problem, logs: Trajectories) -> Windows:
 class Place:
     """Of each log its place among simulations of the prior; findings of why that is unknown."""
 
-    logs: tuple[OutsidePrior, ...]
+    logs: tuple[OutsidePrior, ...] = ()
     findings: tuple[Finding, ...] = ()
 
 
