@@ -29,7 +29,7 @@ _BAND_DRAWS = 64  # of the posterior, whose 5 % and 95 % are drawn
 _NARROW, _FEW_DRAWS = 0.05, 16  # sd of the cube to which the band is to first order; of wider ones so many draws
 _SHORTER = (1.0, 0.5, 0.2, 0.05)  # steps of the starts that are tried, the next where one led uphill
 _SETTLED = 1e-3  # of the sum of squares: a step of the starts that gained less was the last
-_ITERATIONS = 4  # in which starts are looked for
+_ITERATIONS = 2  # in which starts are looked for, near the measured ones
 _AT_LIMIT = 1e-3  # relative: so near to it a correlation time is the longest that may be
 _PIECES = 10  # of a log: errors of neighbouring samples are not independent, of tenths nearly so
 
@@ -254,10 +254,10 @@ def posterior_band(
 def _band(windows: Windows, theta: FloatArray, draws: FloatArray, here: FloatArray) -> FloatArray:
     """Predictions (B, W, L, C) of draws (B, N) about theta (N,), where they are those ``here`` (W, L, C).
 
-    Of a narrow posterior by differences over an sd of each parameter, else of fewer draws.
+    Of a narrow posterior of few parameters by differences over an sd of each, else of fewer draws.
     """
     spread = draws.std(0)
-    if spread.max() > _NARROW:
+    if spread.max() > _NARROW or len(theta) > _FEW_DRAWS:
         few = draws[:: max(1, len(draws) // _FEW_DRAWS)]
         return windows.predict(few, measured_starts(windows, few, theta))[0]
     step = np.where(theta + spread <= 1, 1.0, -1.0) * np.maximum(spread, windows.theta_step)
@@ -305,7 +305,7 @@ def starts_cost(windows: Windows) -> int:
 
 def band_cost(windows: Windows) -> int:
     """Rollouts of ``posterior_band`` at most."""
-    return max(windows.num_theta, _FEW_DRAWS) * len(windows.trajectories)
+    return _FEW_DRAWS * len(windows.trajectories)
 
 
 def best_starts(windows: Windows, theta: FloatArray, noise: Noise) -> FloatArray:

@@ -90,6 +90,8 @@ class Windows:
             raise ValueError(
                 "starts: 'recorded' needs trajectories with states of this model; use 'estimated' for a measured log"
             )
+        if like is not None:
+            self.contacts = like.contacts
         self._cut(trajectories, like)
         self._read_samples(trajectories, like)
 
@@ -150,10 +152,7 @@ class Windows:
         self.num_start, self.start_precision = len(free), free**-2.0
         tight, slopes = measurement_sd(simulator, trajectories)
         self.measured_precision = np.minimum(free, np.maximum(tight[: len(free)], 1e-9)) ** -2.0
-        if self.settings.noise != "ar1":
-            self.start_precision = self.measured_precision
-        elif len(free):  # coloured noise hides in what is measured itself, not in its slopes
-            self.start_precision = np.where(slopes, self.measured_precision, self.start_precision)
+        self.slope_precision = np.where(slopes[: len(free)], self.measured_precision, self.start_precision)
         self.sensors = MeasuredStarts(simulator, trajectories, self.filters.numbers)
 
     @cached_property

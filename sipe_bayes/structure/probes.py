@@ -234,9 +234,9 @@ def _groups(placed: Sequence[Placed]) -> list[list[Placed]]:
     """What is simulated in one batch."""
     groups: dict[str, list[Placed]] = {}
     for one in placed:
-        # a law costs steps of its own, an edit the cube's other models: these are simulated by themselves
-        together = one.edit is None and one.extension.native and len(members(one.site)) == 1
-        key = "" if together else one.label
+        # a law costs steps of its own, an edit makes another model: a law goes with its like, an edit by itself
+        single = one.edit is None and len(members(one.site)) == 1
+        key = ("" if one.extension.native else one.extension.name) if single else one.label
         if any(parameter.log is not None for parameter in one.parameters):
             key = key or "by log"  # which writes what others write for all logs
         groups.setdefault(key, []).append(one)

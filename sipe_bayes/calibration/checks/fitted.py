@@ -11,13 +11,14 @@ import numpy as np
 
 from sipe_bayes.calibration.checks.plan import Check, Checks
 from sipe_bayes.calibration.problem import Problem
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.agreement import LogEstimates, linear_estimates, log_estimates, parts_of
 from sipe_bayes.diagnostics.evaluate import best_starts, channel_noise, white_noise
 from sipe_bayes.diagnostics.records import ChannelNoise, LogReport
+from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.windows.growing_windows import grows
@@ -51,6 +52,9 @@ def with_wild(problem: Problem, method: Estimator) -> list[LogReport]:
     for log, _, channel in method.wild:
         counts[problem.train.names[log]][problem.environment.channels[channel]] += 1
     return [replace(report, wild=dict(counts[report.name])) for report in problem.reports]
+
+
+_LINEARISED = 4000  # control steps of the windows that are linearised for the checks
 
 
 @dataclass(frozen=True)
@@ -93,9 +97,16 @@ class Fit:
         return cls(windows, theta, at.noise, at.starts, linear)
 
     @functools.cached_property
+    def some(self) -> IntArray:
+        """Numbers (K,) of the windows that are linearised: all, or of long logs some, spread evenly over each."""
+        return spread_windows(self.windows, _LINEARISED, every_log=True)
+
+    @functools.cached_property
     def lin(self) -> Linearisation | None:
-        """What changes the windows to first order, where that is of use."""
-        return self.windows.linearise(self.theta, self.starts) if self.linear else None
+        """What changes ``some`` windows to first order, where that is of use."""
+        if not self.linear:
+            return None
+        return self.windows.part(self.some).linearise(self.theta, self.starts[self.some])
 
     def channel_noise(self) -> dict[str, ChannelNoise]:
         """Of each fitted channel."""
@@ -127,7 +138,8 @@ def one_by_one(problem: Problem, fit: Fit, seed: int, checks: Checks) -> LogEsti
         if grows(fit.windows):
             return LogEstimates()
         if fit.lin is not None and fit.lin.valid:
-            alone = linear_estimates(fit.windows, fit.theta, fit.starts, fit.noise, fit.lin, parts_of(fit.windows))
+            part, starts = fit.windows.part(fit.some), fit.starts[fit.some]
+            alone = linear_estimates(part, fit.theta, starts, fit.noise, fit.lin, parts_of(part))
             return LogEstimates(tuple(alone))
         return log_estimates(problem.simulator, problem.likelihood, problem.train, fit.theta, seed, tell, kept)
 

@@ -217,7 +217,8 @@ def asked_windows(method: Estimator, fit: Fit, believed: Posterior) -> AskedWind
     """
     prior = QuadraticPrior.of(believed)
     if not grows(fit.windows):
-        return AskedWindows(fit.windows, fit.theta, fit.starts, fit.noise, prior, fit.lin)
+        windows = fit.windows.part(fit.some)
+        return AskedWindows(windows, fit.theta, fit.starts[fit.some], fit.noise, prior, fit.lin)
     if isinstance(method, Laplace):
         at = method.followed
         return None if at is None else AskedWindows.at(at, fit.windows, prior)
