@@ -55,16 +55,23 @@ def draw(values: Mapping[str, float]) -> Figure:
     return figure
 
 
+def save_figure(run: Path, path: Path) -> None:
+    """Write the figure of a finished run as a PNG of 64 colours."""
+    matplotlib.use("Agg")
+    figure = draw(read_mode(run))
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    with Image.open(path) as picture:
+        smaller = picture.convert("RGB").quantize(64)
+    smaller.save(path, optimize=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="folder of a finished `sipe calibrate`")
     parser.add_argument("--out", type=Path, default=Path("figure.png"))
     given = parser.parse_args()
-    matplotlib.use("Agg")
-    draw(read_mode(given.run)).savefig(given.out, dpi=110)
-    with Image.open(given.out) as picture:
-        smaller = picture.convert("RGB").quantize(64)
-    smaller.save(given.out, optimize=True)
+    save_figure(given.run, given.out)
     print(f"{given.out}: {given.out.stat().st_size / 1e3:.0f} kB")
 
 
