@@ -18,8 +18,11 @@ $(READY): pyproject.toml constraints.txt
 	$(PIP) -e '.[dev]'
 	@touch $@
 
+# a real robot: pendulum or so101
+ROBOT ?= pendulum
+
 demo: $(READY)
-	$(BIN)/python examples/demo.py
+	$(BIN)/python examples/demo.py $(ROBOT)
 
 test: $(READY)
 	$(BIN)/ruff check .

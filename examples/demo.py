@@ -1,5 +1,7 @@
 """``make demo``: calibrate the simple pendulum from one real log, compare it on two others, and ask what it lacks.
 
+``make demo ROBOT=so101`` calibrates an SO-101 arm instead and draws its held-out motions.
+
 The comparison is the error over 0.5 s open-loop windows of logs that were not used for the fit, from the same starts:
 the posterior's mode, the identification published with the logs, and the model as weighed, without friction. Then the
 model as weighed is asked what it lacks (``sipe discover``), which ends with an answer.
@@ -7,6 +9,7 @@ model as weighed is asked what it lacks (``sipe discover``), which ends with an 
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -30,6 +33,7 @@ from sipe_bayes.likelihood.windows import Windows
 
 FOLDER = Path(__file__).parent / "simple_pendulum"
 CONFIG, LACKING = FOLDER / "calibrate.toml", FOLDER / "discover.toml"
+SO101 = Path(__file__).parent / "so101"
 OUT = Path("runs")
 Run = TypeVar("Run")
 
@@ -91,9 +95,9 @@ def fresh(run_into: Callable[[Path], Run], name: str) -> Run:
     raise OutputError(f"{OUT}: holds a hundred demos; delete them")
 
 
-def calibrate(folder: Path) -> Calibration:
+def calibrate(folder: Path, config: Path = CONFIG) -> Calibration:
     with ProgressBar() as progress:
-        return run(CONFIG, out=folder, progress=progress)
+        return run(config, out=folder, progress=progress)
 
 
 def discover(folder: Path) -> Discovery:
@@ -115,7 +119,28 @@ def save_picture(found: Discovery) -> Path:
     return path
 
 
-def main() -> int:
+def show_so101() -> None:
+    """Calibrate the SO-101, print its held-out errors, and draw them beside the report."""
+    sys.path.insert(0, str(SO101))
+    import figure
+    import plain_fit
+
+    found = fresh(lambda folder: calibrate(folder, SO101 / "calibrate.toml"), "demo-so101")
+    print_calibration(found)
+    folder = Path(found.out).resolve()
+    values = plain_fit.nominal_values(), figure.read_mode(folder)
+    before, after = (plain_fit.held_out_errors(v) for v in values)
+    print("\nHeld-out error of one simulation over 30 s (RMSE of the five arm joints, rad)")
+    print(f"{'motion':28}{'nominal':>10}{'calibrated':>12}")
+    for motion in after:
+        print(f"{motion:28}{before[motion]:10.4f}{after[motion]:12.4f}")
+    picture = folder / "held_out.png"
+    figure.save_figure(folder, picture)
+    print(f"\nreport: {folder / 'report.html'}\npicture: {picture}")
+
+
+def show_pendulum() -> None:
+    """Calibrate the pendulum, compare it on held-out logs, and ask what its model lacks."""
     found = fresh(calibrate, "demo")
     print_calibration(found)
     problem = prepare(CONFIG)
@@ -133,6 +158,13 @@ def main() -> int:
     lacking = fresh(discover, "demo-discover")
     save_picture(lacking)
     print_discovery(lacking)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Calibrate a real robot from its logs.")
+    robots = {"pendulum": show_pendulum, "so101": show_so101}
+    parser.add_argument("robot", nargs="?", default="pendulum", choices=list(robots))
+    robots[parser.parse_args().robot]()
     return 0
 
 

@@ -47,7 +47,7 @@ class GaussianMixture(Posterior):
     """sum_k w_k N(means_k, covariances_k), restricted to the cube and divided by its mass there.
 
     ``mean``, ``covariance`` and ``quantile`` are closed-form where every covariance is diagonal (or no component is
-    truncated); otherwise the moments come from at least 16,384 fixed-seed quasi-random points per component and the
+    truncated); otherwise the moments come from 32,768 fixed-seed quasi-random points per component and the
     quantiles from 20,000 fixed-seed draws.
 
     Args:

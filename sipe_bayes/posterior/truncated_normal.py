@@ -19,22 +19,31 @@ psi(z; mu), with
 So E exp psi is the mass for any mu. psi is concave in z and convex in mu; the tilting mu* is its saddle
 point, where the worst ratio is least. With t_k and V_k the mean and variance of the truncated N(mu_k, 1), and
 w = t - mu, the saddle solves t - z = 0 and A^T w - mu = 0; its Hessian blocks are diag(V), diag(V - 1) A - I
-and A^T diag(V - 1) A, and Newton's method finds it. As psi(z; mu*) <= psi* = psi(z*; mu*) for all z,
+and A^T diag(V - 1) A, and SciPy's least squares find it from the mode z of the truncated law, to which the first
+equations assign mu = (I + A^T)^-1 A^T z. As psi(z; mu*) <= psi* = psi(z*; mu*) for all z,
 accepting a draw with probability exp(psi - psi*) is exact, and the acceptance rate is mass / exp(psi*). The
 mass is estimated by averaging exp psi over eight scrambled Sobol sequences of fixed seed; their spread gives
 the standard error. The moments are weighted averages over the same points.
+
+**Approximation.** Where fewer than one draw in a thousand would be accepted (tens of dimensions whose variances
+span many decades), draws are states of up to 500 Markov chains that begin at the mode, after 100 sweeps: Gibbs
+sampling along the eigenvectors of C and the axes, where the conditionals are truncated normals of one dimension.
+Moments are those of such draws, and the standard error of the mass may be large. Elliptical slice sampling
+(``botorch.utils.probability.lin_ess``) needs far more steps: each is as short as the narrowest cut.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cached_property
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from scipy.linalg import solve_triangular
+from scipy.optimize import least_squares, lsq_linear
 from scipy.special import erf, erfcx, log_ndtr, logsumexp, ndtr, ndtri_exp
 from scipy.stats import qmc
 from torch import Generator
@@ -147,11 +156,6 @@ def ordered_cholesky(mean: FloatArray, covariance: FloatArray) -> tuple[IntArray
     return order, factor
 
 
-def _psi(z: FloatArray, mu: FloatArray, lower: FloatArray, low: FloatArray, high: FloatArray) -> float:
-    shift = lower @ z + mu
-    return float((mu**2 / 2 - mu * z + log_interval(low - shift, high - shift)).sum())
-
-
 def _saddle_equations(
     point: FloatArray, lower: FloatArray, low: FloatArray, high: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -167,31 +171,22 @@ def _saddle_equations(
     return gradient, jacobian
 
 
-def saddle_point(lower: FloatArray, low: FloatArray, high: FloatArray) -> tuple[FloatArray, float]:
-    """The tilting mu (N,) and the bound psi*; (0, 0), always valid, if Newton's method should fail."""
-    n = len(low) - 1
-    z = np.zeros(n + 1)
-    for k in range(n):  # start where the untilted proposal's means are: they solve half of the equations
-        shift = lower[k, :k] @ z[:k]
-        z[k] = interval_moments(low[k] - shift, high[k] - shift, 0.0, 1.0)[0]
-    point = np.concatenate([z[:n], np.zeros(n)])
-    gradient, jacobian = _saddle_equations(point, lower, low, high)
-    for _ in range(200):
-        norm = np.linalg.norm(gradient)
-        if norm < 1e-9 * (1 + np.linalg.norm(point)):
-            z, mu = np.append(point[:n], 0.0), np.append(point[n:], 0.0)
-            return mu, _psi(z, mu, lower, low, high)
-        if not (np.isfinite(jacobian).all() and np.isfinite(norm)):
-            break
-        direction = np.linalg.lstsq(jacobian, -gradient, rcond=None)[0]
-        for step in 0.5 ** np.arange(30):
-            trial, trial_jacobian = _saddle_equations(point + step * direction, lower, low, high)
-            if np.linalg.norm(trial) < (1 - 1e-4 * step) * norm:
-                break
-        else:
-            break
-        point, gradient, jacobian = point + step * direction, trial, trial_jacobian
-    return np.zeros(n + 1), 0.0
+def saddle_point(mode: FloatArray, lower: FloatArray, low: FloatArray, high: FloatArray) -> tuple[FloatArray, float]:
+    """The tilting mu (N,) and the bound psi*; (0, 0), always valid, where the ``mode`` z (N,) does not lead there."""
+    mu, bound = np.zeros_like(mode), 0.0
+    start = np.concatenate([mode[:-1], np.linalg.solve(np.eye(len(mode)) + lower.T, lower.T @ mode)[:-1]])
+    with suppress(ValueError, np.linalg.LinAlgError):  # numbers that overflow
+        found = least_squares(
+            lambda point: _saddle_equations(point, lower, low, high)[0],
+            start,
+            jac=lambda point: _saddle_equations(point, lower, low, high)[1],
+            **{"method": "dogbox", "x_scale": "jac", "max_nfev": 200, "ftol": 1e-15, "xtol": 1e-15, "gtol": 1e-15},
+        )
+        if np.linalg.norm(found.fun) < 1e-9 * (1 + np.linalg.norm(found.x)):
+            z, mu = (np.append(half, 0.0) for half in np.split(found.x, 2))
+            shift = lower @ z + mu
+            bound = float((mu**2 / 2 - mu * z + log_interval(low - shift, high - shift)).sum())
+    return mu, bound
 
 
 class TruncatedNormal:
@@ -203,12 +198,12 @@ class TruncatedNormal:
         log_mass: with its standard error, when it is known already, so that it is not estimated again.
     """
 
-    relative_error: ClassVar[float] = 1e-4  # of a mass, which is aimed at
     scrambles: ClassVar[int] = 8  # Sobol sequences, whose spread is the error
-    first_points: ClassVar[int] = 2**11  # of each sequence
-    most_points: ClassVar[int] = 2**13
+    points: ClassVar[int] = 2**12  # of each sequence
     rejection_mass: ClassVar[float] = 0.05  # above it plain draws are thrown away until enough are inside
-    least_acceptance: ClassVar[float] = 1e-6  # of tilted draws, below which drawing would take forever
+    least_acceptance: ClassVar[float] = 1e-3  # of tilted draws, below which Markov chains take their place
+    chains: ClassVar[int] = 500
+    sweeps: ClassVar[int] = 100  # of a chain over all directions before its first draw
     most_tries: ClassVar[float] = 1e3  # times what a draw should take, before its mass is called wrong
 
     def __init__(self, mean: FloatArray, covariance: FloatArray, log_mass: tuple[float, float] | None = None) -> None:
@@ -260,7 +255,18 @@ class TruncatedNormal:
         diagonal = np.diag(factor).copy()
         lower = factor / diagonal[:, None] - np.eye(len(diagonal))
         low, high = -self.mean[order] / diagonal, (1 - self.mean[order]) / diagonal
-        return Tilting(order, diagonal, lower, low, high, *saddle_point(lower, low, high))
+        mode = solve_triangular(factor, (self._mode - self.mean)[order], lower=True)
+        return Tilting(order, diagonal, lower, low, high, *saddle_point(mode, lower, low, high))
+
+    @cached_property
+    def _mode(self) -> FloatArray:
+        found = lsq_linear(self.whitening, self.whitening @ self.mean, (0.0, 1.0), method="bvls", tol=1e-14)
+        return np.asarray(np.clip(found.x, 0.0, 1.0), dtype=np.float64)
+
+    @cached_property
+    def _rate(self) -> float:
+        """The share of tilted draws that are accepted."""
+        return math.exp(min(self.log_mass - self._tilting.log_bound, 0.0))
 
     def _propose(self, uniforms: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Draws theta (n, N) and log likelihood ratios psi (n,) of uniform numbers (n, N)."""
@@ -276,21 +282,10 @@ class TruncatedNormal:
         return np.clip(theta + self.mean, 0.0, 1.0), psi
 
     def _points(self) -> tuple[FloatArray, FloatArray]:
-        """Draws theta (8, n, N) and psi (8, n) at eight scrambled Sobol sequences, n doubled until precise."""
+        """Draws theta (8, n, N) and psi (8, n) at eight scrambled Sobol sequences."""
         engines = [qmc.Sobol(len(self.mean), scramble=True, seed=seed) for seed in range(self.scrambles)]
-        uniforms = np.stack([engine.random(self.first_points) for engine in engines])
-        theta, psi = self._propose_batch(uniforms)
-        while psi.shape[1] < self.most_points:
-            masses = np.exp(logsumexp(psi, axis=1) - logsumexp(psi))
-            if masses.std(ddof=1) / masses.mean() / math.sqrt(self.scrambles) < self.relative_error / 2:
-                break
-            more = self._propose_batch(np.stack([engine.random(psi.shape[1]) for engine in engines]))
-            theta, psi = np.concatenate([theta, more[0]], 1), np.concatenate([psi, more[1]], 1)
-        return theta, psi
-
-    def _propose_batch(self, uniforms: FloatArray) -> tuple[FloatArray, FloatArray]:
-        theta, psi = self._propose(uniforms.reshape(-1, uniforms.shape[-1]))
-        return theta.reshape(uniforms.shape), psi.reshape(uniforms.shape[:-1])
+        theta, psi = self._propose(np.concatenate([engine.random(self.points) for engine in engines]))
+        return theta.reshape(self.scrambles, -1, len(self.mean)), psi.reshape(self.scrambles, -1)
 
     def moments(self) -> tuple[FloatArray, FloatArray]:
         """Mean (N,) and covariance (N, N) of the truncated distribution."""
@@ -299,23 +294,40 @@ class TruncatedNormal:
         if self.diagonal:
             mean, variance = interval_moments(np.zeros_like(self.mean), np.ones_like(self.mean), self.mean, self.sd)
             return mean, np.diag(variance)
+        if self._rate < self.least_acceptance:
+            theta = self._chain_draws(20 * self.chains, torch.Generator().manual_seed(0))
+            return theta.mean(0), np.cov(theta.T)
         return self._estimate.mean, self._estimate.covariance
 
     def sample(self, n: int, generator: Generator | None) -> FloatArray:
-        """Exact draws (n, N)."""
+        """Draws (n, N): exact, or of Markov chains where too few would be accepted."""
         if self.diagonal:
             uniforms = torch.rand(n, len(self.mean), dtype=torch.float64, generator=generator).numpy()
             a, b = -self.mean / self.sd, (1 - self.mean) / self.sd
             return np.clip(self.mean + self.sd * interval_quantile(a, b, uniforms), 0.0, 1.0)
         if self.log_mass > math.log(self.rejection_mass):
             return self._accepted(n, math.exp(self.log_mass), self._plain_draws, generator)
-        rate = math.exp(min(self.log_mass - self._tilting.log_bound, 0.0))
-        if rate < self.least_acceptance:
-            raise RuntimeError(
-                f"sample: one draw in {1 / max(rate, 1e-300):.0e} would be accepted; the covariance is too "
-                "close to singular in the tail, add a little to its diagonal"
-            )
-        return self._accepted(n, rate, self._tilted_draws, generator)
+        if self._rate < self.least_acceptance:
+            return self._chain_draws(n, generator)
+        return self._accepted(n, self._rate, self._tilted_draws, generator)
+
+    def _chain_draws(self, n: int, generator: Generator | None) -> FloatArray:
+        """States (n, N) of Markov chains from the mode, by Gibbs sampling along eigenvectors and axes."""
+        directions = np.concatenate([np.linalg.eigh(self.covariance)[1].T, np.eye(len(self.mean))])
+        slopes = directions @ self.whitening.T @ self.whitening
+        chains = max(1, min(n, self.chains))
+        theta, draws = np.tile(self._mode, (chains, 1)), []
+        for _ in range(self.sweeps + math.ceil(max(n, 1) / chains)):
+            for k in torch.randperm(len(directions), generator=generator).tolist():
+                direction, sd = directions[k], (slopes[k] @ directions[k]) ** -0.5
+                used, centre = direction != 0, (self.mean - theta) @ slopes[k] * sd**2
+                ends = np.sort(np.stack([-theta[:, used], 1 - theta[:, used]]) / direction[used], axis=0)
+                low, high = (ends[0].max(1) - centre) / sd, (ends[1].min(1) - centre) / sd
+                uniforms = torch.rand(chains, dtype=torch.float64, generator=generator).numpy()
+                length = centre + sd * interval_quantile(low, high, uniforms)
+                theta = np.clip(theta + length[:, None] * direction, 0.0, 1.0)
+            draws.append(theta)
+        return np.concatenate(draws[self.sweeps :])[:n]
 
     def _accepted(self, n: int, rate: float, draw: Draw, generator: Generator | None) -> FloatArray:
         accepted: list[FloatArray] = [np.empty((0, len(self.mean)))]

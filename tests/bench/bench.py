@@ -26,6 +26,7 @@ import arm
 import batch
 import ddpg
 import envs
+import everyday
 import executors
 import fits
 import laws
@@ -246,7 +247,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     tables = (
         *("engine", "batch", "rival", "stages", "chain", "envs", "memory", "mdn", "fits", "ddpg", "laws", "executors"),
-        *("discover", "transfer", "shapes"),
+        *("discover", "transfer", "shapes", "everyday"),
     )
     parser.add_argument("tables", nargs="*", help=f"any of {', '.join(tables)}; default all")
     parser.add_argument("--pairs", type=int, default=7)
@@ -272,6 +273,8 @@ def main() -> None:
             ddpg.table(given.pairs, side_by_side)
         elif name == "executors":
             executors.table()
+        elif name == "everyday":
+            everyday.table()
         elif name == "laws":
             laws.table(given.pairs, side_by_side)
         elif name == "discover":

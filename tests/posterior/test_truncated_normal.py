@@ -124,3 +124,102 @@ def test_exact_sampler_in_thirty_dimensions() -> None:
     row_means = theta.mean(1)
     assert row_means.mean() == pytest.approx(expected, abs=SIGMAS * row_means.std() / math.sqrt(3000))
     np.testing.assert_allclose(truncated.moments()[0], expected, atol=2e-3)
+
+
+SERVO_MEAN = np.array([0.1677, -0.4955, 0.0295, 0.5545, 0.1188])
+SERVO = np.array(
+    [
+        [0.000411, 0.000112, 0.000015, 0.000713, 0.000106],
+        [0.000112, 366.227886, -31.394467, -0.003646, 0.01217],
+        [0.000015, -31.394467, 2.691266, 0.000266, -0.001039],
+        [0.000713, -0.003646, 0.000266, 0.003271, -0.000388],
+        [0.000106, 0.01217, -0.001039, -0.000388, 0.001094],
+    ]
+)
+
+
+def test_nearly_singular_covariance_whose_mass_is_small() -> None:
+    """A servo's posterior: two parameters of sd 19 and 1.6 that are almost one, and a mass of 1e-8."""
+    truncated = TruncatedNormal(SERVO_MEAN, SERVO)
+    theta = truncated.sample(20_000, seeded(20))
+    # reference: importance sampling, the two from a uniform box that holds them, the others given them
+    rng, pair, rest = np.random.default_rng(0), np.array([1, 2]), np.array([0, 3, 4])
+    width = np.array([0.1, 0.012])
+    box = width * rng.random((400_000, 2))
+    slope = np.linalg.solve(SERVO[np.ix_(pair, pair)], SERVO[np.ix_(pair, rest)])
+    left = SERVO[np.ix_(rest, rest)] - SERVO[np.ix_(rest, pair)] @ slope
+    others = SERVO_MEAN[rest] + (box - SERVO_MEAN[pair]) @ slope + rng.multivariate_normal(np.zeros(3), left, len(box))
+    log_density = stats.multivariate_normal(SERVO_MEAN[pair], SERVO[np.ix_(pair, pair)]).logpdf(box)
+    weight = np.exp(log_density - log_density.max()) * ((others >= 0) & (others <= 1)).all(1)
+    log_mass = math.log(weight.mean()) + log_density.max() + np.log(width).sum()
+    share, points = weight / weight.sum(), np.c_[others[:, :1], box, others[:, 1:]]
+    effective = 1 / np.square(share).sum()
+    mean = share @ points
+    sd = np.sqrt(share @ np.square(points - mean))
+    error = sd * math.sqrt(1 / effective + 1 / len(theta))
+    print(f"{effective:.0f} effective points, acceptance {truncated._rate:.3f}, {(theta.mean(0) - mean) / error}")
+    assert effective > 5000
+    assert (np.abs(theta.mean(0) - mean) < SIGMAS * error).all()
+    assert (np.abs(truncated.moments()[0] - mean) < SIGMAS * sd / math.sqrt(effective)).all()
+    np.testing.assert_allclose(theta.std(0), sd, rtol=SIGMAS / math.sqrt(effective))
+    assert truncated.log_mass == pytest.approx(log_mass, abs=SIGMAS / math.sqrt(effective))
+
+
+@pytest.mark.parametrize("sampler", ["tilted", "chains"])
+@pytest.mark.parametrize("n", [2, 4, 8])
+def test_samplers_against_rejection(sampler: str, n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each marginal, its two tails of a tenth and the first principal component; 56 tests at 1e-5: 6e-4 by chance."""
+    monkeypatch.setattr(TruncatedNormal, "rejection_mass", 2.0)
+    monkeypatch.setattr(TruncatedNormal, "least_acceptance", 0.0 if sampler == "tilted" else 2.0)
+    rng = np.random.default_rng(n)
+    basis = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    covariance = (basis * np.geomspace(0.5, 1e-3, n) ** 2) @ basis.T
+    mean = rng.uniform(0.0, 1.0, n)
+    theta = TruncatedNormal(mean, covariance).sample(8000, seeded(21))
+    plain = rng.multivariate_normal(mean, covariance, 2_000_000)
+    plain = plain[((plain >= 0) & (plain <= 1)).all(1)]
+    assert len(plain) > 8000
+    columns = np.c_[np.eye(n), np.linalg.eigh(covariance)[1][:, -1]]
+    for ours, reference in zip((theta @ columns).T, (plain @ columns).T, strict=True):
+        low, high = np.quantile(reference, [0.1, 0.9])
+        assert stats.ks_2samp(ours, reference).pvalue > 1e-5
+        assert stats.ks_2samp(ours[ours < low], reference[reference < low]).pvalue > 1e-5
+        assert stats.ks_2samp(ours[ours > high], reference[reference > high]).pvalue > 1e-5
+
+
+def spread_problem(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations from 1e-4 to 100 along random directions, means in and out of the cube."""
+    rng = np.random.default_rng(100 * n + seed)
+    basis = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    covariance = (basis * np.exp(rng.uniform(np.log(1e-4), np.log(100), n)) ** 2) @ basis.T
+    return rng.uniform(-0.3, 1.3, n), (covariance + covariance.T) / 2
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5, 10, 20, 30])
+def test_any_covariance_is_sampled(n: int) -> None:
+    """Nearly singular ones too: draws and moments lie in the cube, and a seed gives the same draws again."""
+    for seed in range(1 if n > 10 else 3):
+        mean, covariance = spread_problem(n, seed)
+        truncated = TruncatedNormal(mean, covariance)
+        theta = truncated.sample(200, seeded(22))
+        assert theta.shape == (200, n)
+        assert ((theta >= 0) & (theta <= 1)).all()
+        assert np.isfinite(truncated.log_mass)
+        centre, spread = truncated.moments()
+        assert ((centre >= 0) & (centre <= 1)).all()
+        assert (np.diag(spread) > 0).all()
+        again = TruncatedNormal(mean, covariance).sample(200, seeded(22))
+        np.testing.assert_array_equal(theta, again)
+
+
+def test_chains_where_hardly_a_draw_is_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thirty dimensions over six decades: one draw in 1,400 would be accepted; chains come within half a sd of them."""
+    truncated = TruncatedNormal(*spread_problem(30, 8))
+    assert truncated._rate < truncated.least_acceptance
+    chains = truncated.sample(500, seeded(23))
+    monkeypatch.setattr(TruncatedNormal, "least_acceptance", 0.0)
+    exact = truncated.sample(200, seeded(24))
+    off, ratio = np.abs(chains.mean(0) - exact.mean(0)) / exact.std(0), chains.std(0) / exact.std(0)
+    print(f"means off by up to {off.max():.2f} sd, ratio of sds {ratio.min():.2f} to {ratio.max():.2f}")
+    assert off.max() < 0.5
+    assert 0.7 < ratio.min() < ratio.max() < 1.4
