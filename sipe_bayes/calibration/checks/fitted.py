@@ -68,7 +68,7 @@ class Fit:
     """The windows of the training logs at theta (N,): noise, and best starts (W, D).
 
     ``linear``: whether what changes them to first order is of use: not without windows of the fit's own, nor of bodies
-    that tumble.
+    that tumble. ``least_squares``: whether theta is that of plain least squares, though residuals are coloured.
     """
 
     windows: Windows
@@ -76,6 +76,7 @@ class Fit:
     noise: Noise
     starts: FloatArray
     linear: bool
+    least_squares: bool = False
 
     @classmethod
     def of(cls, problem: Problem, method: Estimator, theta: FloatArray, checks: Checks) -> Fit:
@@ -94,7 +95,8 @@ class Fit:
 
         at = checks.of(Check.STARTS, _At, made)
         linear = not (chain or grows(windows) or len(windows.trajectories) < 2)
-        return cls(windows, theta, at.noise, at.starts, linear)
+        plain = bool(method.diagnostics.get("least_squares"))
+        return cls(windows, theta, at.noise, at.starts, linear, plain)
 
     @functools.cached_property
     def some(self) -> IntArray:
@@ -139,7 +141,11 @@ def one_by_one(problem: Problem, fit: Fit, seed: int, checks: Checks) -> LogEsti
             return LogEstimates()
         if fit.lin is not None and fit.lin.valid:
             part, starts = fit.windows.part(fit.some), fit.starts[fit.some]
-            alone = linear_estimates(part, fit.theta, starts, fit.noise, fit.lin, parts_of(part))
+            noise, memory = fit.noise, None
+            if fit.least_squares:
+                share = np.exp(-float(part.dt.min()) / np.maximum(noise.tau, 1e-12))
+                noise, memory = Noise(noise.sd, np.zeros_like(noise.tau)), (1 + share) / (1 - share)
+            alone = linear_estimates(part, fit.theta, starts, noise, fit.lin, parts_of(part), memory)
             return LogEstimates(tuple(alone))
         return log_estimates(problem.simulator, problem.likelihood, problem.train, fit.theta, seed, tell, kept)
 

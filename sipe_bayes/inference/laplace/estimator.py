@@ -325,6 +325,8 @@ class Laplace(Estimator[LaplaceState]):
         """
         best = kept[0]
         self.diagnostics = {"modes": len(kept), "noise_sd": best.sd.tolist(), "noise_tau": best.tau.tolist()}
+        if isinstance(state.search, SolverState) and state.search.behind_noise:
+            self.diagnostics["least_squares"] = True
         if isinstance(best, ChainOptimum):
             self.diagnostics |= best.diagnostics()
             if not best.settled:

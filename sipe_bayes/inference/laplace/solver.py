@@ -38,6 +38,7 @@ from scipy.stats import chi2
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.findings import Code, finding
+from sipe_bayes.inference.laplace.options import ContactTuning
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.laplace.windows.contact_starts import begins_in_contact
 from sipe_bayes.inference.laplace.windows.energy import WindowEnergy, misfit, present_noise, same_noise, updated_noise
@@ -52,6 +53,8 @@ from sipe_bayes.likelihood.restricted import eliminate_starts, marginal
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.wild_samples import wild_residuals
 from sipe_bayes.likelihood.windows import Linearisation, Windows
+from sipe_bayes.simulation.callable_simulator import CallableSimulator
+from sipe_bayes.simulation.simulator import Simulator
 
 _DAMPINGS = np.array([0.03, 1.0, 30.0, 1000.0])  # tried together, times the damping of the step before
 _CHEAP = 8  # columns of a linearisation for each of them: a trial is to cost little beside it
@@ -558,16 +561,15 @@ class SegmentSolver:
         return replace(state, done=True)
 
     def _is_poor(self, optimum: WindowOptimum) -> bool:
-        """Whether the residuals are far larger than what samples scatter by, and a good part of what channels do."""
+        """Whether residuals are far larger than what samples scatter by, and a good part of what channels do."""
         windows = self.windows
-        if not windows.num_start:
-            scatter = np.maximum(windows.fixed_sd, windows.rounding)
-            return bool((optimum.sd > self.tuning.poor * np.where(np.isnan(scatter), np.inf, scatter)).any())
+        if isinstance(windows.simulator, CallableSimulator):
+            return True  # a function has no nominal model to begin with
         large = optimum.sd > self.tuning.gross * windows.spread
         return bool((large & (optimum.sd > self.tuning.poor * level(windows).sd)).any())
 
     def _further(self, state: SolverState) -> SolverState:
-        """Further starting points: the best of draws from the prior."""
+        """Further starting points: the best of draws from the prior that are not near the optimum."""
         view = self._view(0)[1]
         options = self.problem.options
         generator = torch.Generator().manual_seed(self.problem.seed + 1)
@@ -580,6 +582,8 @@ class SegmentSolver:
         finally:
             counted(self.windows, view, before)
         loss = np.array([self._profile(view, r) if ok else np.inf for r, ok in zip(residual, valid, strict=True)])
+        away = np.linalg.norm(drawn - state.optima[-1].theta, axis=1)
+        loss = np.where(away >= np.median(away), loss, np.inf)  # near ones end at the same optimum
         order = np.argsort(loss, kind="stable")[: min(options.restarts - 1, int(np.isfinite(loss).sum()))]
         points = np.concatenate([state.points, drawn[order]])
         if not len(order):
@@ -639,5 +643,11 @@ def spread_segments(log: IntArray, share: float) -> IntArray:
 
 
 def fits_segments(windows: Windows) -> bool:
-    """Whether the segments are fitted by this solver: no impact interrupts them, and no known start lies in contact."""
-    return not grows(windows) and not begins_in_contact(windows)
+    """Whether the segments are fitted by this solver: no impact interrupts them.
+
+    Nor do they begin at known states in contact, or go on from these for so long that they may be chaotic.
+    """
+    if grows(windows) or begins_in_contact(windows):
+        return False
+    known = not windows.num_start and isinstance(windows.simulator, Simulator)
+    return not (known and windows.steps.max() >= ContactTuning().long)

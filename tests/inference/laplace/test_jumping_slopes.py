@@ -55,7 +55,7 @@ def searched(windows: Windows, given: FloatArray, horizon: int) -> list[Position
     """Every step of the search on the first beginnings."""
     n = windows.num_theta
     prior = QuadraticPrior(np.full(n, 0.5), np.zeros((n, n)))
-    here = Position.at(windows, given, DampingRule(), subset=False)
+    here = Position.at(windows, given, DampingRule())
     here = replace(here, phase=Phase.GROW, horizon=horizon, theta_step=TUNING.widest, alone=True)
     steps = [here]
     while steps[-1].horizon == horizon and steps[-1].phase is Phase.GROW:
