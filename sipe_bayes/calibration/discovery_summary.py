@@ -32,7 +32,7 @@ from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.records import Comparison, Signal
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.unknowns import bounded_by_nature
-from sipe_bayes.inference.laplace.windows.measured_starts import measured_starts
+from sipe_bayes.inference.laplace.windows.growing_windows import measured_starts
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.windows import Windows

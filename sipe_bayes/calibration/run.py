@@ -252,7 +252,10 @@ def _looks(
         "diagnostics of the estimator": lambda: _own(method, asked),
         "rigid bodies": lambda: no_rigid_bodies(problem.environment, result.posterior, method.seed),
         "diagnostics of the checks": lambda: [
-            *(finding(Code.AGREEMENT_UNKNOWN, log=name) for name in answers.alone.skipped),
+            *(
+                finding(Code.CHECKS_SKIPPED, checks=Check.LOGS.value, log=name, reason=f"log {name} gives no optimum")
+                for name in answers.alone.skipped
+            ),
             *lacks.findings,
             *place.findings,
         ],

@@ -114,7 +114,6 @@ ADVICE: dict[Code, str] = {
         "its driver; else at what the model lacks."
     ),
     Code.NOT_SMOOTH: f"{_COMPARE} {_SMOOTHER}",
-    Code.KINK: "Nothing to do, unless intervals are too wide: other motions have their kinks elsewhere.",
     Code.STARTS_AT_REST: (
         "Without a pose a window of a free body starts anywhere but where the body was. Measure it, or take the "
         "likelihood that infers states."
@@ -200,6 +199,7 @@ ADVICE: dict[Code, str] = {
         f"{_REMEDY_LACKING} Until then read the values as those of a model that is wrong, unless the first sentences "
         "say that it was put in."
     ),
+    Code.LEAST_SQUARES: "Run `sipe discover`: it looks for the physics that the model lacks.",
     Code.NOISE_DRIFTS: (
         "A model that lacks something leaves such residuals, or a zero that differs between logs: run `sipe discover`. "
         "For predictions compare with "
@@ -211,7 +211,6 @@ ADVICE: dict[Code, str] = {
         "show is not seen. Judge by the held-out logs."
     ),
     Code.NOISE_FREE: "Nothing to do. A log from a machine has noise: add some before you judge what a log would tell.",
-    Code.MISFIT_UNKNOWN: "Judge by the residuals in the report and by the held-out logs.",
     Code.UNTOLD: (
         "Motion tells masses, inertias and friction only in the scale of the forces, with where they lie, and delays "
         "and a servo's gains with when each joint is read. Weigh one part and fix its mass with `actuator:NAME.gain` "
@@ -235,13 +234,11 @@ ADVICE: dict[Code, str] = {
         "Units and signs are right, since the simulation bends as the log does. One of twenty right logs is called so. "
         "Else widen the bounds that a value lies at, or let `sipe discover` look for the physics that the model lacks."
     ),
-    Code.OUTSIDE_PRIOR_UNKNOWN: "Judge by the signals in the report.",
     Code.LOGS_DISAGREE: (
         "Did something change between the logs: load, temperature, a zero, a battery, a screw? Then `per_log = "
         "true`. If not, the model lacks what the logs show differently: `sipe discover`."
     ),
     Code.LOGS_DISAGREE_UNEXPLAINED: _REMEDY_LACKING,
-    Code.AGREEMENT_UNKNOWN: "Alone it is too short or poor, or no optimum came. It still counts in the joint fit.",
     Code.HELD_OUT_DIVERGES: (
         "The calibrated model explodes on a motion that it was not fitted on: look at parameters at a bound, train "
         "on such motion too."

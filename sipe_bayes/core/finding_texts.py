@@ -172,9 +172,6 @@ class Code(Enum):
         "at the optimum the simulation is not what its linearisation says, by {gain:.1f} nats of a step or of a "
         "point nearby: it is not smooth there (friction, contact or delay); compare with mcmc"
     )
-    KINK = caution(
-        "at the optimum a step that promised {gain:.0f} nats gained none (a kink, of dry friction?): intervals hold it"
-    )
     STARTS_AT_REST = blocking(
         "the measurements do not tell the whole pose of joint {joint}: every window starts the rest of it where the "
         "model has it; measure {needed}, or use likelihood = 'state_space'"
@@ -270,6 +267,10 @@ class Code(Enum):
     MISFIT_SHIFTS = caution(
         _NOT_NOISE + "; with {which} in the model the estimate would move, {moved}: {remedy}", "model lacks something"
     )
+    LEAST_SQUARES = note(
+        "Plain and generalised least squares differ by more than coloured noise allows (Hausman test, p < 0.001). "
+        "The estimates are those of plain least squares. Their intervals allow for the correlation of the residuals"
+    )
     NOISE_DRIFTS = caution(
         "noise of {channels} has a correlation time as long as the logs ({tau:.2g} s): mostly changes from sample to "
         "sample were fitted, hardly where the motion goes"
@@ -280,7 +281,6 @@ class Code(Enum):
         "the model explains the logs but for {share:.0e} of what they move, as where they were simulated without "
         "noise: what is left is rounding, and says nothing of the model; the intervals are those of rounding too"
     )
-    MISFIT_UNKNOWN = caution("whether the residuals are noise is unknown: {reason}")
     UNTOLD = note("these logs can not tell {causes}; then values are off by more than the sd that they have: {moved}")
     CHECKS_THINNED = note("of the fit's {windows} windows {asked}, spread evenly, were asked what the model lacks")
     RESIDUALS_LEFT_OUT = note(
@@ -312,7 +312,6 @@ class Code(Enum):
         "before the fit, nothing that is simulated follows {channel!r}: short windows miss {times:.2g} times what "
         "going on straight does; look at its zero, unit and sign, which sipe init tries, and at what the model lacks"
     )
-    OUTSIDE_PRIOR_UNKNOWN = caution("whether the logs lie within the prior is unknown: {reason}")
     LOGS_DISAGREE = blocking(
         "the logs disagree about {parameters} (p = {p:.1g}): the others being common, {estimates}; "
         "give it per_log = true, model what changed, or leave a log out{without}",
@@ -323,7 +322,6 @@ class Code(Enum):
         "differently in them; {most}{without}",
         "disagrees between logs",
     )
-    AGREEMENT_UNKNOWN = caution("log {log} could not be fitted by itself; whether it agrees is unknown")
     TRAIN_WORSE = blocking(
         "on the very logs that it was fitted to the calibrated model is worse than the model as given (its error is "
         "{ratio:.3g} times larger): the search ended in a wrong place; set search.start, narrow the bounds or shorten "

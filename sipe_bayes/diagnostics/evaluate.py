@@ -18,8 +18,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Residual, Signal
 from sipe_bayes.inference.laplace.options import GrowingTuning
-from sipe_bayes.inference.laplace.windows.growing_windows import grown_starts, grows
-from sipe_bayes.inference.laplace.windows.measured_starts import measured_starts
+from sipe_bayes.inference.laplace.windows.growing_windows import grown_starts, grows, measured_starts
 from sipe_bayes.likelihood.noise import Noise, whiten
 from sipe_bayes.likelihood.restricted import marginal
 from sipe_bayes.likelihood.windows import Windows

@@ -22,7 +22,7 @@ from sipe_bayes.likelihood.windows import Windows
 
 GRID = (0.0, 0.25, 0.5, 0.75, 1.0)  # of theta, where parameters are tried
 _SEVERAL = 2  # parameters that a measured value has to tell beside itself
-_LOOKED_AT = 2000  # control steps: what does something there is not asked again of all windows
+_LOOKED_AT = 400  # control steps: what does something there is not asked again of all windows
 
 
 def dead_ranges(windows: Windows, theta: FloatArray) -> dict[str, list[tuple[float, float]]]:

@@ -203,7 +203,7 @@ def headline(
     good = [p for p in wanted if _of_the_logs(p, findings).tone == "good"]
     if not good:
         return Verdict("bad", "No value may be trusted within its interval; the table says why.")
-    unasked = bool(findings.of(Code.MISFIT_NOT_ASKED, Code.MISFIT_UNKNOWN, Code.WINDOWS_NOT_FOLLOWED))
+    unasked = bool(findings.of(Code.MISFIT_NOT_ASKED, Code.CHECKS_SKIPPED, Code.WINDOWS_NOT_FOLLOWED))
     hanging = [p.name for p in good if _hangs(p, findings)]
     conditions = ["if the model lacks nothing"] if unasked else []
     if hanging:

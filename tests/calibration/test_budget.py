@@ -70,7 +70,7 @@ def test_what_nature_bounds_is_told_apart_from_a_bound_that_was_chosen(tmp_path:
 
 
 def test_findings_of_one_kind_about_many_logs_are_one_line() -> None:
-    many = [finding(Code.AGREEMENT_UNKNOWN, log=f"run{k}") for k in range(12)]
+    many = [finding(Code.CHECKS_SKIPPED, log=f"run{k}", checks="agreement", reason=f"run{k}") for k in range(12)]
     kinds = Findings([*many, finding(Code.BUDGET_SPENT, budget=5)]).kinds
     assert len(kinds) == 2
     assert kinds[0].startswith("the budget of 5 rollouts")

@@ -16,7 +16,7 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import ESTIMATORS
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.screening import screen
+from sipe_bayes.inference.laplace.windows.contact_starts import screen
 from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.inference.search.base import Search
 from sipe_bayes.likelihood.binding import bind

@@ -14,7 +14,7 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.laplace.windows.measured_starts import measured_starts
+from sipe_bayes.inference.laplace.windows.growing_windows import measured_starts
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows

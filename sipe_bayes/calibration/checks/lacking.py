@@ -98,9 +98,7 @@ class Lacking:
         return MissingPhysics(further, self.missing.causes, self.missing.explained)
 
 
-NOTHING_ASKED = Lacking(
-    None, None, None, (), (finding(Code.MISFIT_UNKNOWN, reason="the check has no result, see the other warnings"),)
-)
+NOTHING_ASKED = Lacking(None, None, None, (), ())
 
 
 def lacking(
@@ -175,7 +173,7 @@ def _probed(
         unknown.extend(_left_out(fit.windows, asked, probed.windows))
         unknown.extend(tolerance_findings(probed, untold(probed, problem.tolerances)))
     except ValueError as error:  # LinAlgError is one
-        unknown.append(finding(Code.MISFIT_UNKNOWN, reason=error))
+        unknown.append(finding(Code.CHECKS_SKIPPED, checks=Check.LACKING.value, reason=error))
         return None
     return asked, probed
 

@@ -122,7 +122,7 @@ def place_in_prior(problem: Problem, method: Estimator, fit: Fit, seen: Predicti
         try:
             looks = outside_prior(fit.windows, problem.prior, noise, seed=method.seed, followed=followed)
         except ValueError as error:
-            return Place((), (finding(Code.OUTSIDE_PRIOR_UNKNOWN, reason=error),))
+            return Place((), (finding(Code.CHECKS_SKIPPED, checks=Check.PRIOR.value, reason=error),))
         return Place(tuple(looks))
 
     return checks.of(Check.PRIOR, Place, made)

@@ -20,63 +20,38 @@ and the noise maximises its restricted likelihood, in which theta and x are inte
 with A = J' V^{-1} J + diag(0, P_x) and g what still pulls on theta: where a parameter sits at a bound, the normal's
 mean lies beyond it, and the truncated density is right up to the bound.
 
+**Three fits** share this energy, the noise by restricted likelihood and the optimum's normal (``windows.optimum``):
+
+- ``solver.SegmentSolver`` fits segments that no impact interrupts, which is the everyday case: plain least squares
+  first, then theta, initial states and noise together, on ever more segments. Its docstring has the phases.
+- ``windows.search.WindowSearch`` fits bodies that tumble, strike or slip, by beginnings of segments that grow, and
+  chaotic or touching motion from known states. ``windows.followed`` chooses the segments that the model follows; their
+  normal is the posterior, or the scatter of groups of segments (``windows.followed_posterior``).
+- ``state_space`` fits models whose state is unknown at every sample (``StateSpace``).
+
 **Steps** (``estimator.Laplace``):
 
-1. Choose starting points: the model as given and the best of a few draws from the prior (``screening``); where windows
-   begin at known states, through contact or over long logs, by beginnings that grow (``windows.contact_starts``).
-2. From each, go downhill by damped Gauss-Newton steps (``levenberg_marquardt.descend``), noise and (theta, x) in turn.
-3. Record where that ends (``windows.optimum.summarised``): mean, covariance, evidence; widen the normal by the moments
-   over a handful of weighted noise values; where starts are estimated, ask points two sds away whether it is too narrow
-   and take slopes between them then (``windows.wide_differences``).
-4. Look around (``windows.pattern_search``) and go on from a better place, or from the middle of a ridge.
-5. Send scouts from draws of the prior: whoever comes to rest as low elsewhere is a further starting point
-   (``windows.scouting``). Where starts are not measured and the logs are not followed, go on from where longer windows
-   lead (``windows.longer_windows``).
-6. Through impacts fit groups of windows apart (``windows.growing_windows``), choose the windows that the model follows
-   and go to their optimum (``windows.followed``); its normal is the posterior, or the scatter of the groups
-   (``windows.followed_posterior``).
-7. Keep the optima that are not the same and within ten nats of the best (``strategy.distinct``); they become components
+1. Fit, from the nominal model, and from further starting points where the fit is poor. Where initial states are not
+   measured and the logs are not followed, go on from where longer segments lead (``windows.longer_windows``).
+2. Keep the optima that are not the same and within ten nats of the best (``strategy.distinct``); they become components
    of a mixture, weighted by their restricted likelihood.
-8. Probe whether the optima's normals are the posterior (``inference.importance``), and whether that goes on beyond a
+3. Probe whether the optima's normals are the posterior (``inference.importance``), and whether that goes on beyond a
    single one (``inference.stretches``); where they do not stand, importance draws and kernels on them take the normals'
    place, each optimum's on its own draws (``windows.draws``).
 
-**Phases** of the search over windows (``windows.state.Phase``, a function each in ``windows.search.WindowSearch``)::
+All are a ``strategy.Strategy``: made of a ``SearchProblem`` and the bound logs, with a frozen state of their own.
 
-    starting point
-        |                  starts are measured
-        +-----------------------------------------> SUBSET  theta alone, every other window
-        |                                             |  a step gains little
-        |          some window diverges               v
-        +<----------------------------------------- WHOLE   first step on all windows
-        v                                             |
-      ROUGH  white noise of the residuals' size <-----+
-        |  nothing left to gain          \  half of the steps are taken
-        v                                 v
-      NOISE  estimated anew, a step  --> DESCEND  noise as it was
-        |    ^-----------------------------+  nothing left to gain
-        |  nothing moves any more
-        v
-      optimum --> middle of a ridge, longer differences, or a better point around: DESCEND from there
-        |
-        v
-      next starting point, or done
-
-    through impacts:  GROW beginnings, then ROUGH as above; after the last point each group of windows GROW, then FOLLOW
-
-With ``StateSpace`` every sample's state is unknown and ``state_space.search`` takes the place of ``windows.search``, or
-``state_space.known_starts`` where the first states are known. All are a ``strategy.Strategy``: made of a
-``SearchProblem`` and the bound logs, with a frozen state of their own.
-
-**To change how steps are damped**, change ``levenberg_marquardt.DampingRule.after``: every search asks it and nothing
-else. ``tests/inference/laplace/test_levenberg_marquardt.py`` tells. Other numbers of the search are the fields of
-``options.LaplaceTuning``, each with its reason: ``Laplace(simulator, tuning=LaplaceTuning(...))``.
+**To change how steps are damped**, change ``levenberg_marquardt.DampingRule.after``: every search but ``solver`` asks
+it and nothing else. ``tests/inference/laplace/test_levenberg_marquardt.py`` tells. Other numbers of the search are the
+fields of ``options.LaplaceTuning``, each with its reason: ``Laplace(simulator, tuning=LaplaceTuning(...))``.
 
 **Deviations** from the textbook:
 
 - Directions that the data leave open get a normal of sd 10 about the cube's centre, flat within the cube to half a
   percent, so that the covariance exists and the result does not depend on the start.
 - The uncertainty of the noise widens the normal (not with ``StateSpace``).
+- Where plain and generalised least squares differ by more than coloured noise allows (Hausman's test, ``solver``), the
+  optimum is that of plain least squares and its width the sandwich, as with ``noise="sandwich"``.
 - Residuals below what the simulation's own rounding leaves are no independent evidence: such a channel counts as one
   sample, not as many.
 - With ``noise="sandwich"`` the optimum is that of plain least squares and only the width comes from autoregressive

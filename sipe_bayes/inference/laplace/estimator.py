@@ -327,6 +327,7 @@ class Laplace(Estimator[LaplaceState]):
         self.diagnostics = {"modes": len(kept), "noise_sd": best.sd.tolist(), "noise_tau": best.tau.tolist()}
         if isinstance(state.search, SolverState) and state.search.behind_noise:
             self.diagnostics["least_squares"] = True
+            self.find(Code.LEAST_SQUARES)
         if isinstance(best, ChainOptimum):
             self.diagnostics |= best.diagnostics()
             if not best.settled:

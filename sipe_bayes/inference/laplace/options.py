@@ -141,17 +141,9 @@ class SolverTuning(Options):
     plain_gain: float = option(2.0, "gain of a step below which the plain fit has converged", "nats", above=0)
     most_steps: int = option(60, "steps from one starting point", least=2)
     most_points: int = option(6, "starting points, with those found on the way", least=1)
-    share: float = option(0.3, "of the conditional posterior sd, by which finite differences are long", above=0)
-    first_length: float = option(1e-3, "of the first differences", "of the cube", above=0)
-    shortest: float = option(1e-6, "of all differences", "of the cube", above=0)
-    longest: float = option(0.02, "of all differences", "of the cube", above=0)
     linearised_steps: float = option(5e5, "physics steps of a linearisation, until the fit has nearly converged")
     whole: float = option(4.0, "times as many at the end, at most: more segments are left out", least=1)
     poor: float = option(3.0, "residuals over what samples scatter by from which more starting points are tried")
-    gross: float = option(0.1, "of what a channel does, below which residuals are never poor", above=0)
-    takes_over: float = option(1e-3, "chance below which coloured noise is not what residuals are", above=0, below=1)
-    worse: float = option(1.03, "free-run error over the plain fit's from which white noise takes over", above=1)
-    follows: float = option(0.5, "of what a channel does: with larger errors a free run follows no log", above=0)
 
 
 @dataclass(frozen=True)

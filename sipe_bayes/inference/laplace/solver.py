@@ -12,11 +12,11 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
 2. FIT: theta and the initial states, noise by restricted likelihood before each step; on the same part, then on all
    segments up to ``fitted_steps``. Columns of the initial states are kept while they predict what a step gains.
 3. COMPARE: the plain fit and the posterior mode each run free along the whole training logs. Where the mode is worse by
-   more than ``worse``, coloured noise has taken over what parameters explain. Then the estimate is that of white
+   more than 3 %, coloured noise has taken over what parameters explain. Then the estimate is that of white
    noise, fitted again from the plain fit, and the interval is the sandwich (``likelihood.noise_spread``), which holds
    for coloured residuals.
 
-**Differences** are as long as ``share`` of the conditional posterior sd of what they move, so that slopes are those of
+**Differences** are as long as a third of the conditional posterior sd of what they move, so that slopes are those of
 the posterior's width, whatever dry friction or a delay does below it.
 
 **More starting points** are followed only where the fit is poor: residuals larger than ``poor`` times what samples
@@ -57,8 +57,8 @@ from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
 _DAMPINGS = np.array([0.03, 1.0, 30.0, 1000.0])  # tried together, times the damping of the step before
-_CHEAP = 8  # columns of a linearisation for each of them: a trial is to cost little beside it
-_LONGEST = 0.3  # of the cube: the longest step of a parameter
+_DIFFERENCE = 0.3  # conditional posterior sds that a finite difference is long
+_WORSE = 1.03  # free-run error over the plain fit's from which white noise takes over
 
 
 class Stage(StrEnum):
@@ -289,20 +289,15 @@ class SegmentSolver:
         """Lengths (N + D,) of the finite differences."""
         n, scale = view.num_theta, here.scale
         if not len(scale):
-            known = self.tuning.share / np.sqrt(np.maximum(view.start_precision, 1e-12))
-            scale = np.concatenate([np.full(n, self.tuning.first_length), np.clip(known, 1e-6, 1e-3)])
+            known = _DIFFERENCE / np.sqrt(np.maximum(view.start_precision, 1e-12))
+            scale = np.concatenate([np.full(n, 1e-3), np.clip(known, 1e-6, 1e-3)])
         return np.concatenate([np.maximum(scale[:n], view.least_steps(here.theta)), scale[n:]])
 
     def _scaled(self, view: Windows, precision: FloatArray, starts: FloatArray | None) -> FloatArray:
         """Lengths (N + D,) for the next differences, of the diagonals of precisions (N, N) and (D,)."""
-        tuning, n = self.tuning, len(precision)
-        of_theta = tuning.share / np.sqrt(np.maximum(np.diag(precision), 1e-12))
-        of_theta = np.clip(of_theta, tuning.shortest, tuning.longest)
-        if starts is None:
-            starts = view.start_precision
-        return np.concatenate([of_theta, np.clip(tuning.share / np.sqrt(np.maximum(starts, 1e-12)), 1e-7, 1e-2)])[
-            : n + view.num_start
-        ]
+        of_theta = np.clip(_DIFFERENCE / np.sqrt(np.maximum(np.diag(precision), 1e-12)), 1e-6, 0.02)
+        known = view.start_precision if starts is None else starts
+        return np.concatenate([of_theta, np.clip(_DIFFERENCE / np.sqrt(np.maximum(known, 1e-12)), 1e-7, 1e-2)])
 
     def _plain(self, state: SolverState) -> SolverState:
         here, (_, view) = state.here, self._view(state.here.part)
@@ -356,13 +351,13 @@ class SegmentSolver:
     def _moved(self, hessian: FloatArray, pull: FloatArray, theta: FloatArray, damping: float) -> FloatArray:
         """Where a damped step from theta (N,) leads (N,)."""
         move = damped_box_step(hessian, pull, theta, damping)
-        return np.clip(theta + np.clip(move, -_LONGEST, _LONGEST), 0.0, 1.0)
+        return np.clip(theta + np.clip(move, -0.3, 0.3), 0.0, 1.0)
 
     def _dampings(self, here: Here) -> FloatArray:
         """Those that are tried."""
         columns = self.windows.num_theta + self.windows.num_start + 1
         easy = 2 if here.damping <= self.tuning.damping else 3
-        return np.asarray(here.damping * _DAMPINGS[: max(easy, min(columns // _CHEAP, len(_DAMPINGS)))])
+        return np.asarray(here.damping * _DAMPINGS[: max(easy, min(columns // 8, len(_DAMPINGS)))])
 
     def _damped(self, damping: float) -> float:
         return float(np.clip(damping, 1e-7, 1e4))
@@ -448,7 +443,7 @@ class SegmentSolver:
                 spread, plain = inverse @ (middle + prior) @ inverse, inverse
         apart = steps[1] - steps[0]
         wider = float(np.exp(np.log(np.diag(spread) / np.diag(plain)).mean()))
-        return bool(chi2.sf(apart @ np.linalg.solve(spread, apart), n) < self.tuning.takes_over), max(wider, 1.0)
+        return bool(chi2.sf(apart @ np.linalg.solve(spread, apart), n) < 1e-3), max(wider, 1.0)
 
     def _linearised(self, view: Windows, here: Here, starts: FloatArray) -> tuple[Linearisation, bool, FloatArray]:
         """Linearisation of a part, whether all of it is new, and the lengths of its differences."""
@@ -565,7 +560,7 @@ class SegmentSolver:
         windows = self.windows
         if isinstance(windows.simulator, CallableSimulator):
             return True  # a function has no nominal model to begin with
-        large = optimum.sd > self.tuning.gross * windows.spread
+        large = optimum.sd > 0.1 * windows.spread
         return bool((large & (optimum.sd > self.tuning.poor * level(windows).sd)).any())
 
     def _further(self, state: SolverState) -> SolverState:
@@ -594,7 +589,7 @@ class SegmentSolver:
         """Hold the mode's free-run error against the plain fit's."""
         best = max(state.optima, key=lambda one: one.evidence)
         ratio = self.free_run_ratio(best.theta, state.plain)
-        state = replace(state, freed=True, behind=ratio if ratio > self.tuning.worse else 0.0)
+        state = replace(state, freed=True, behind=ratio if ratio > _WORSE else 0.0)
         if not state.behind:
             return replace(state, done=True)
         self.problem.tell("white noise, from the plain fit", self.windows.rollouts)
@@ -616,10 +611,10 @@ class SegmentSolver:
                 residual, valid = view.residuals(np.stack([theta, plain]), starts)
                 sizes = np.stack([present_noise(view, r).sd for r in residual])
                 moving = (view.spread > 0) & np.isnan(view.fixed_sd)
-                if not valid.all() or not (sizes[1] < self.tuning.follows * view.spread)[moving].all():
+                if not valid.all() or not (sizes[1] < 0.5 * view.spread)[moving].all():
                     break
                 ratio = float(np.exp(np.log(sizes[0] / sizes[1])[moving].mean()))
-                if ratio <= self.tuning.worse or starts.any():
+                if ratio <= _WORSE or starts.any():
                     return ratio
                 starts = np.stack([self._best_starts(view, at) for at in (theta, plain)])
         return 1.0

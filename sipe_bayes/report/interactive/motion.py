@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.inference.laplace.windows.measured_starts import measured_starts
+from sipe_bayes.inference.laplace.windows.growing_windows import measured_starts
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.starts.estimates import estimate_states
 from sipe_bayes.likelihood.windows import Windows

@@ -12,7 +12,7 @@ from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.sensing import Sensing
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.windows.measured_starts import measured_starts
+from sipe_bayes.inference.laplace.windows.growing_windows import measured_starts
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows

@@ -198,6 +198,17 @@ def told_starts(windows: Windows, theta: FloatArray, tuning: GrowingTuning) -> F
     return starts
 
 
+def measured_starts(windows: Windows, theta: FloatArray, near: FloatArray | None = None) -> FloatArray:
+    """Starts (B, W, D) of theta (B, N): zero is what was measured; of bodies that tumble their first moments tell more.
+
+    Of these the starts of ``near`` (N,) serve all, default each theta its own.
+    """
+    if tells_starts(windows) and windows.trajectories.states is None:
+        own = [told_starts(windows, at, GrowingTuning()) for at in (theta if near is None else near[None])]
+        return np.broadcast_to(np.stack(own), (len(theta), *own[0].shape))
+    return np.tile(windows.no_starts(), (len(theta), 1, 1))
+
+
 def lent(windows: Windows, view: Windows) -> int:
     """Let a view of the windows, which simulates a share of them, spend what they have left; the rollouts until now."""
     before, share = windows.rollouts, float(view.steps.sum() / windows.steps.sum())

@@ -216,7 +216,6 @@ def judged(
         way = float(np.sqrt(((ending.theta - ending.begin) ** 2).mean()))
         covariance = covariance + (way * min(1.0, left)) ** 2 * np.eye(len(ending.theta))
     if is_broken(problem, windows, ending.theta, ending.refused):
-        reason = reason or finding(Code.KINK, gain=ending.refused)
         # the normal's middle lies where a slope led that no simulation follows
         refused = _within_cube(ending.theta, optimum.mean - ending.theta)
         optimum, covariance = replace(optimum, mean=ending.theta), covariance + np.outer(refused, refused)
