@@ -80,6 +80,7 @@ def _without_history(full: Simulator) -> mujoco.MjModel:
         for actuator in spec.actuators:
             actuator.nsample, actuator.delay = 0, 0.0
         model = spec.compile()
+        model.actuator_delay[:] = full.model.actuator_delay
     model.opt.disableflags = full.model.opt.disableflags
     model.opt.timestep = full.model.opt.timestep
     return model

@@ -16,7 +16,7 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.importance import ImportanceTuning
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.options import LaplaceTuning, WindowTuning
+from sipe_bayes.inference.laplace.options import LaplaceTuning, SolverTuning, WindowTuning
 from sipe_bayes.inference.laplace.strategy import distinct
 from sipe_bayes.inference.laplace.windows.state import WindowOptimum
 from sipe_bayes.inference.recorded import Progress
@@ -231,7 +231,8 @@ class Fitting:
     ) -> _Optimum:
         """The best optimum of some logs."""
         given = None if initial is None else initial[None]
-        tuning = LaplaceTuning(windows=_COARSE, importance=ImportanceTuning(wanted=False))  # it takes the optimum alone
+        one_noise = SolverTuning(compares=False)  # evidences of different noise do not compare
+        tuning = LaplaceTuning(windows=_COARSE, solver=one_noise, importance=ImportanceTuning(wanted=False))
         laplace = Laplace(
             simulator,
             prior=prior,

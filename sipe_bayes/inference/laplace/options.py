@@ -143,6 +143,9 @@ class SolverTuning(Options):
     most_points: int = option(6, "starting points, with those found on the way", least=1)
     linearised_steps: float = option(5e5, "physics steps of a linearisation, until the fit has nearly converged")
     whole: float = option(4.0, "times as many at the end, at most: more segments are left out", least=1)
+    compares: bool = option(
+        True, "whether plain least squares takes over where coloured noise explains what it should not"
+    )
     poor: float = option(3.0, "residuals over what samples scatter by from which more starting points are tried")
 
 

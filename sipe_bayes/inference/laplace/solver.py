@@ -38,14 +38,13 @@ from scipy.stats import chi2
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.findings import Code, finding
-from sipe_bayes.inference.laplace.options import ContactTuning
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.inference.laplace.windows.contact_starts import begins_in_contact
 from sipe_bayes.inference.laplace.windows.energy import WindowEnergy, misfit, present_noise, same_noise, updated_noise
 from sipe_bayes.inference.laplace.windows.growing_windows import counted, grows, lent, level
 from sipe_bayes.inference.laplace.windows.optimum import Ending, summarised
 from sipe_bayes.inference.laplace.windows.state import WindowOptimum, WindowState
 from sipe_bayes.likelihood.minimise import damped_box_step
+from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.noise_spread import sandwich
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION
@@ -53,8 +52,6 @@ from sipe_bayes.likelihood.restricted import eliminate_starts, marginal
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.wild_samples import wild_residuals
 from sipe_bayes.likelihood.windows import Linearisation, Windows
-from sipe_bayes.simulation.callable_simulator import CallableSimulator
-from sipe_bayes.simulation.simulator import Simulator
 
 _DAMPINGS = np.array([0.03, 1.0, 30.0, 1000.0])  # tried together, times the damping of the step before
 _DIFFERENCE = 0.3  # conditional posterior sds that a finite difference is long
@@ -215,9 +212,7 @@ class SegmentSolver:
     def _share(self, part: int) -> float:
         """Of the segments that a part holds."""
         windows = self.windows
-        skip = np.ones(windows.num_windows)
-        if windows.num_start:
-            skip = np.array([windows.simulator.physics_steps(float(dt))[0] for dt in windows.dt])
+        skip = np.array([windows.simulator.physics_steps(float(dt))[0] for dt in windows.dt])
         columns = windows.num_theta + windows.num_start + 1
         most = self.tuning.linearised_steps / columns * (0.25, 1.0, self.tuning.whole)[part]
         return float(most / (windows.steps * skip).sum())
@@ -300,7 +295,7 @@ class SegmentSolver:
         return np.concatenate([of_theta, np.clip(_DIFFERENCE / np.sqrt(np.maximum(known, 1e-12)), 1e-7, 1e-2)])
 
     def _plain(self, state: SolverState) -> SolverState:
-        here, (_, view) = state.here, self._view(state.here.part)
+        here, (keep, view) = state.here, self._view(state.here.part)
         n, starts, before = view.num_theta, view.no_starts(), lent(self.windows, view)
         try:
             scale = self._lengths(view, here)
@@ -336,16 +331,23 @@ class SegmentSolver:
         part = self._next_part(Stage.PLAIN, here.part)
         if part is not None and after.iteration < self.tuning.most_steps:
             return replace(state, here=replace(after, part=part, residual=None))
-        return self._plain_ended(state, after, view)
+        return self._plain_ended(replace(state, here=here), after, lin, keep, view)
 
-    def _plain_ended(self, state: SolverState, here: Here, view: Windows) -> SolverState:
+    def _plain_ended(
+        self, state: SolverState, here: Here, lin: Linearisation, keep: IntArray, view: Windows
+    ) -> SolverState:
         """From the plain fit on theta, initial states and noise are fitted together."""
         if not len(state.plain):
             state = replace(state, plain=here.theta)
             self.problem.tell("first estimate", self.windows.rollouts)
-        if here.residual is not None and not state.optima and len(wild := wild_residuals(view, here.residual)):
-            state = replace(state, wild=np.concatenate([state.wild, wild]))
-            here = replace(here, residual=None)
+        if not state.optima:
+            still = np.zeros((*lin.residual.shape, view.num_start))
+            lin = replace(lin, jacobian=np.concatenate([lin.jacobian, still], axis=-1))
+            at = replace(state.here, noise=here.noise, iteration=here.iteration)
+            state = replace(state, optima=(self._optimum(state, at, lin, view.moments(lin, True), keep, view, False),))
+            if here.residual is not None and len(wild := wild_residuals(view, here.residual)):
+                state = replace(state, wild=np.concatenate([state.wild, wild]))
+                here = replace(here, residual=None)
         return replace(state, here=replace(here, stage=Stage.FIT, damping=self.tuning.damping, starts_jacobian=None))
 
     def _moved(self, hessian: FloatArray, pull: FloatArray, theta: FloatArray, damping: float) -> FloatArray:
@@ -371,7 +373,7 @@ class SegmentSolver:
             if not lin.valid:  # on more segments than before: from the initial states that were measured
                 here = replace(here, starts=self.windows.no_starts(), residual=None)
                 lin, fresh, scale = self._linearised(view, replace(here, starts_jacobian=None), here.starts[keep])
-            if state.stage_begins:
+            if state.stage_begins and self.tuning.compares:
                 takes_over, wider = self._noise_takes_over(view, here, lin)
                 here = replace(here, white=takes_over)
                 view = self._as_measured(view) if takes_over else view
@@ -405,6 +407,7 @@ class SegmentSolver:
         if settled or stuck or last:
             part = None if last else self._next_part(Stage.FIT, here.part)
             if part is not None:
+                state = self._recorded(state, self._optimum(state, after, lin, moments, keep, view, False))
                 return replace(state, here=replace(after, part=part, residual=None, starts_jacobian=None))
             return self._ended(state, after, lin, moments, keep, view, settled or stuck)
         foretold = trial.gained > 0.75 * trial.expected
@@ -460,14 +463,14 @@ class SegmentSolver:
         view: Windows,
         here: Here,
         lin: Linearisation,
-        moments: object,
+        moments: Moments,
         noise: Noise,
         starts: FloatArray,
         tolerance: float,
     ) -> tuple[_Trial, FloatArray | None]:
         """The best of a batch of damped steps of theta and the initial states, and lengths of the next differences."""
         energy, n = WindowEnergy(view, noise, self.prior), view.num_theta
-        normal = moments.normal(noise)  # type: ignore[attr-defined]
+        normal = moments.normal(noise)
         now = energy(here.theta, starts, lin.residual)
         pull, thetas, changes, expected = -view.start_precision * starts, [], [], 0.0
         scale = None
@@ -506,60 +509,78 @@ class SegmentSolver:
 
     # The end
 
-    def _ended(
+    def _optimum(
         self,
         state: SolverState,
         here: Here,
         lin: Linearisation,
-        moments: object,
+        moments: Moments,
         keep: IntArray,
         view: Windows,
         settled: bool,
-    ) -> SolverState:
-        """Record the optimum; then compare it with the plain fit, or go on from further starting points."""
-        if here.white and self.windows.settings.noise != "white":
+    ) -> WindowOptimum:
+        """The normal where a part of the segments was linearised; unless ``settled`` one that says that it is early."""
+        if settled and here.white and self.windows.settings.noise != "white":
             view = view.part(np.arange(view.num_windows))
             view.settings = replace(view.settings, noise="sandwich")
+        begin, starts = state.points[state.point], here.starts[keep]
         ending = Ending(
             here.theta,
-            here.starts[keep],
+            starts,
             here.noise,
-            moments,  # type: ignore[arg-type]
+            moments,
             lin.residual,
             lin.jacobian,
-            state.points[state.point],
+            begin,
             here.iteration,
             here.misfit,
-            0.0,
-            False,
-            settled,
-            not settled and self._leaves_no_room(),
-            None,
+            refused=0.0,
+            tells=False,
+            settled=settled,
+            cut_short=not settled,
+            bettered=None,
         )
         optimum = summarised(self.problem, view, ending)
         slope = np.zeros((self.windows.num_windows, self.windows.num_start, view.num_theta))
         slope[keep] = optimum.slope
         reason = None
-        if ending.cut_short:
-            reason = finding(Code.SEARCH_CUT_SHORT)
-        elif not settled:
-            reason = finding(Code.SEARCH_UNSETTLED, steps=here.iteration)
-        optimum = replace(optimum, starts=here.starts, slope=slope, finding=reason)
-        state = replace(state, optima=(*state.optima, optimum), here=replace(here, residual=None, starts_jacobian=None))
+        if not settled:
+            steps, whole = here.iteration, here.iteration >= self.tuning.most_steps
+            reason = finding(Code.SEARCH_UNSETTLED, steps=steps) if whole else finding(Code.SEARCH_CUT_SHORT)
+        return replace(optimum, starts=here.starts, slope=slope, finding=reason)
+
+    def _ended(
+        self,
+        state: SolverState,
+        here: Here,
+        lin: Linearisation,
+        moments: Moments,
+        keep: IntArray,
+        view: Windows,
+        settled: bool,
+    ) -> SolverState:
+        """Record the optimum; then compare it with the plain fit, or go on from further starting points."""
+        optimum = self._optimum(state, here, lin, moments, keep, view, settled)
+        state = self._recorded(state, optimum)
+        state = replace(state, here=replace(here, residual=None, starts_jacobian=None))
         if self._is_poor(optimum) and not state.scouted and self.problem.options.restarts > 1:
             return self._further(state)
         if state.point + 1 < len(state.points):
             point = state.point + 1
             return replace(state, point=point, here=self._begin(state.points[point]))
-        if not here.white and len(state.plain) and not state.freed:
+        if self.tuning.compares and not here.white and len(state.plain) and not state.freed:
             return replace(state, here=replace(here, stage=Stage.COMPARE, residual=None, starts_jacobian=None))
         return replace(state, done=True)
+
+    def _recorded(self, state: SolverState, optimum: WindowOptimum) -> SolverState:
+        """With an optimum in the place of what was recorded on the way to it."""
+        early = [k for k, one in enumerate(state.optima) if one.finding is not None]
+        kept = state.optima[: early[-1]] if early and early[-1] == len(state.optima) - 1 else state.optima
+        return replace(state, optima=(*kept, optimum))
 
     def _is_poor(self, optimum: WindowOptimum) -> bool:
         """Whether residuals are far larger than what samples scatter by, and a good part of what channels do."""
         windows = self.windows
-        if isinstance(windows.simulator, CallableSimulator):
-            return True  # a function has no nominal model to begin with
         large = optimum.sd > 0.1 * windows.spread
         return bool((large & (optimum.sd > self.tuning.poor * level(windows).sd)).any())
 
@@ -592,9 +613,10 @@ class SegmentSolver:
         state = replace(state, freed=True, behind=ratio if ratio > _WORSE else 0.0)
         if not state.behind:
             return replace(state, done=True)
+        early = tuple(replace(one, finding=finding(Code.SEARCH_CUT_SHORT)) for one in state.optima)
         self.problem.tell("white noise, from the plain fit", self.windows.rollouts)
         here = replace(self._begin(state.plain), stage=Stage.FIT, part=1, white=True)
-        return replace(state, optima=(), here=here)
+        return replace(state, optima=early[-1:], here=here)
 
     def free_run_ratio(self, theta: FloatArray, plain: FloatArray) -> float:
         """How many times the free-run error of ``plain`` (N,) that of theta (N,) is; geometric mean over channels.
@@ -638,11 +660,5 @@ def spread_segments(log: IntArray, share: float) -> IntArray:
 
 
 def fits_segments(windows: Windows) -> bool:
-    """Whether the segments are fitted by this solver: no impact interrupts them.
-
-    Nor do they begin at known states in contact, or go on from these for so long that they may be chaotic.
-    """
-    if grows(windows) or begins_in_contact(windows):
-        return False
-    known = not windows.num_start and isinstance(windows.simulator, Simulator)
-    return not (known and windows.steps.max() >= ContactTuning().long)
+    """Whether the segments are fitted by this solver: their initial states are estimated, no impact interrupts them."""
+    return windows.num_start > 0 and not grows(windows)
