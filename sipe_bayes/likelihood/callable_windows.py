@@ -44,8 +44,7 @@ class CallableWindows(Windows):
             )
         self.actions = trajectories.actions
         self.sequences = sequences(self.observed, np.tile([0, 1], (count, 1)), self.log, self.dt)
-        self.reference, self.num_start, self.start_precision = np.zeros((count, 0)), 0, np.zeros(0)
-        self.measured_precision = self.slope_precision = np.zeros(0)
+        self.reference, self.num_start, self.weak_precision = np.zeros((count, 0)), 0, np.zeros(0)
 
     @property
     def starts_measured(self) -> bool:

@@ -149,11 +149,32 @@ class Windows:
         self.number = np.arange(len(self.log))
         self.filters = FilterStarts(simulator, trajectories, self.reference, self.log, self.start, recorded)
         free = start_sd(simulator, trajectories) if self.settings.starts == "estimated" else np.zeros(0)
-        self.num_start, self.start_precision = len(free), free**-2.0
+        self.num_start, self.weak_precision = len(free), free**-2.0
         tight, slopes = measurement_sd(simulator, trajectories)
         self.measured_precision = np.minimum(free, np.maximum(tight[: len(free)], 1e-9)) ** -2.0
-        self.slope_precision = np.where(slopes[: len(free)], self.measured_precision, self.start_precision)
+        self.slope_precision = np.where(slopes[: len(free)], self.measured_precision, self.weak_precision)
         self.sensors = MeasuredStarts(simulator, trajectories, self.filters.numbers)
+
+    @cached_property
+    def start_precision(self) -> FloatArray:
+        """Of the prior of a start (D,): as well as it is measured, but weak through impacts, which smoothing hides.
+
+        Coloured noise hides in what is measured itself, not in its slopes.
+        """
+        if not self.num_start or self.grows:
+            return self.weak_precision
+        return self.slope_precision if self.settings.noise == "ar1" else self.measured_precision
+
+    @cached_property
+    def grows(self) -> bool:
+        """Whether bodies tumble or strike something, or slip on it; with starts to estimate.
+
+        A body that flies and touches nothing moves as smoothly as joints do.
+        """
+        if not (self.num_start and self.starts_measured):
+            return False
+        contacts = self.contacts
+        return contacts.change or contacts.rough or (contacts.touch and bool(self.simulator.environment.poses))
 
     @cached_property
     def contacts(self) -> Contacts:

@@ -159,9 +159,6 @@ class SegmentSolver:
 
     def __init__(self, problem: SearchProblem, windows: Windows) -> None:
         self.problem, self.windows = problem, windows
-        # coloured noise hides in what is measured itself, not in its slopes
-        coloured = windows.settings.noise == "ar1"
-        windows.start_precision = windows.slope_precision if coloured else windows.measured_precision
         self.tuning, self.prior = problem.options.tuning.solver, problem.quadratic_prior
         self._views: dict[int, tuple[IntArray, Windows]] = {}
 

@@ -87,12 +87,9 @@ class ManyStarts(LinearisedWindows):
 def grows(windows: Windows) -> bool:
     """Whether windows are searched by their beginnings: bodies that tumble or strike something, or slip on it.
 
-    With starts to estimate. A body that flies and touches nothing moves as smoothly as joints do.
+    With starts to estimate.
     """
-    if not (windows.num_start and windows.starts_measured):
-        return False
-    contacts = windows.contacts
-    return contacts.change or contacts.rough or (contacts.touch and bool(windows.simulator.environment.poses))
+    return windows.grows
 
 
 def first_horizon(windows: Windows, tuning: GrowingTuning) -> int:
