@@ -300,7 +300,8 @@ def _simulated(
             at += len(shape)
             with np.errstate(invalid="ignore"):
                 change = np.where(windows.observed, predicted[mine] - predicted[0], 0.0)
-            use = valid[mine] & np.isfinite(change).all((1, 2, 3)) & (np.abs(change).max((1, 2, 3)) > 0)
+            moves = (np.abs(change) > 1e-9 * windows.spread).any((1, 2, 3))  # and not by rounding alone
+            use = valid[mine] & np.isfinite(change).all((1, 2, 3)) & moves
             if valid[0] and use.any():
                 trades = np.tile(trade, (int(use.sum()), 1))
                 out.append(Effect(one, np.moveaxis(change[use], 0, -1), shape[use], trades))

@@ -19,7 +19,6 @@ from sipe_bayes.calibration.checks.plan import Check, plan_of
 from sipe_bayes.calibration.problem import Problem, method_of, prepare
 from sipe_bayes.calibration.run import calibrate
 from sipe_bayes.cli.app import app
-from sipe_bayes.diagnostics import agreement
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.likelihood.windows import Windows
@@ -128,18 +127,6 @@ def test_parts_of_a_check_are_kept(problem: Problem, tmp_path: Path, monkeypatch
     assert (groups(), draws()) == (0, of_draws - 1)
     kept = {file.name for file in (tmp_path / "out" / "checks").iterdir()}
     assert kept == {f"{check.name.lower()}.safetensors" for check in Check}
-
-
-def test_logs_are_not_fitted_again(apart: Problem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    checkpoint, fits = tmp_path / "out" / "checkpoint.safetensors", counted(monkeypatch, agreement, "_alone")
-    progress = Stopped(f"check 2 of {len(Check)}, what each log says by itself: log other by itself, 2 of 2")
-    with pytest.raises(KeyboardInterrupt):
-        calibrate(apart, checkpoint=checkpoint, progress=progress)
-    assert fits() == 1
-    assert any("log log by itself, 1 of 2, laplace: start 1" in what for what in progress.heard), progress.heard
-    resumed = calibrate(apart, checkpoint=checkpoint)
-    assert fits() == 1
-    assert reported(resumed) == reported(calibrate(apart))
 
 
 def test_checks_of_another_fit_are_made_again(problem: Problem, undisturbed: Calibration, tmp_path: Path) -> None:

@@ -519,7 +519,7 @@ class SegmentSolver:
         """The normal where a part of the segments was linearised; unless ``settled`` one that says that it is early."""
         if settled and here.white and self.windows.settings.noise != "white":
             view = view.part(np.arange(view.num_windows))
-            view.settings = replace(view.settings, noise="sandwich")
+            view.settings, moments = replace(view.settings, noise="sandwich"), view.moments(lin)
         begin, starts = state.points[state.point], here.starts[keep]
         ending = Ending(
             here.theta,
@@ -624,7 +624,8 @@ class SegmentSolver:
         windows = self.windows
         settings = replace(windows.settings, window=None, windows=(), noise="white", seconds=None)
         for view in (Windows(settings, windows.simulator, windows.trajectories), windows):
-            starts = np.tile(view.no_starts(), (2, 1, 1))
+            view, starts = copy.copy(view), np.tile(view.no_starts(), (2, 1, 1))
+            view.start_precision = view.weak_precision  # a whole log tells where it began
             for _ in range(2):
                 windows.spend(2)
                 residual, valid = view.residuals(np.stack([theta, plain]), starts)

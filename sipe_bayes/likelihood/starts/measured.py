@@ -90,7 +90,7 @@ def measurement_sd(simulator: Simulator, trajectories: Trajectories) -> tuple[Fl
 
     It is infinite where nothing measures a coordinate.
 
-    What local quadratics over twice as many samples differ from the usual ones, root mean square, doubled: that holds
+    What local quadratics over twice as many samples differ from the usual ones, root mean square, times three: that holds
     noise and what smoothing bends, and is safe at the ends of a log, where a quadratic is least sure.
     """
     model = simulator.model
@@ -117,7 +117,7 @@ def measurement_sd(simulator: Simulator, trajectories: Trajectories) -> tuple[Fl
                 count[coordinate] += len(series)
                 slopes[coordinate] = derivative == 1
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(count > 0, 2 * np.sqrt(square / count), np.inf), slopes
+        return np.where(count > 0, 3 * np.sqrt(square / count), np.inf), slopes
 
 
 def _quantum(series: FloatArray) -> float:
