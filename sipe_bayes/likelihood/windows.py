@@ -368,6 +368,7 @@ class Windows:
         residual: FloatArray | None = None,
         theta_step: float | FloatArray | None = None,
         start_step: float | FloatArray = STATE_STEP,
+        axes: FloatArray | None = None,
     ) -> Linearisation:
         """Residual and Jacobian: one batch of N + D + 1 simulations of the logs, in float64.
 
@@ -379,17 +380,18 @@ class Windows:
             residual: (W, L, C), of a valid simulation at this very point, which spares the one.
             theta_step: of the differences, of the cube; default ``self.theta_step``; ``least_steps`` where longer.
             start_step: the same of the starts, a number or (D,).
+            axes: (N, N), rows along which theta is changed in place of each parameter by itself.
 
         Raises:
             BudgetExhausted: instead of simulating beyond the budget.
         """
         n, d = (self.num_theta if with_theta else 0), (self.num_start if with_starts else 0)
         size = np.maximum(self.theta_step if theta_step is None else theta_step, self.least_steps(theta))
+        ways = size * np.eye(self.num_theta) if axes is None else axes
         of_starts = np.broadcast_to(start_step, self.num_start)[:d]
-        sign = np.where(theta + size <= 1, 1.0, -1.0)
         thetas, all_starts = np.tile(theta, (n + d + 1, 1)), np.tile(starts, (n + d + 1, 1, 1))
-        for j in range(n):
-            thetas[j + 1, j] += sign[j] * size[j]
+        moves = inward(theta, ways[:n])
+        thetas[1 : n + 1] += moves
         for j in range(d):
             all_starts[n + 1 + j, :, j] += of_starts[j]
         if residual is None:
@@ -401,15 +403,19 @@ class Windows:
         wrong = [j for j in range(n) if not valid[j + 1]]
         # a step across a physical limit: look the other way
         if wrong and valid[0]:
-            sign[wrong] = -sign[wrong]
-            again, rows = np.tile(theta, (len(wrong), 1)), np.array(wrong) + 1
-            again[np.arange(len(wrong)), wrong] += sign[wrong] * size[wrong]
-            predicted[rows], valid[rows] = self.predict(np.clip(again, 0, 1), all_starts[: len(wrong)], True)
+            rows, moves[wrong] = np.array(wrong) + 1, -moves[wrong]
+            again = np.clip(theta + moves[wrong], 0, 1)
+            predicted[rows], valid[rows] = self.predict(again, all_starts[: len(wrong)], True)
         predicted[1:] = self.continued(predicted[1:], predicted[0])
-        scale = np.concatenate([sign[:n] * size[:n], of_starts])[:, None, None, None]
         with np.errstate(invalid="ignore"):
-            jacobian = (predicted[1:] - predicted[0]) / scale
-        jacobian = np.where(self.observed & valid[1:, None, None, None], jacobian, 0.0)
+            change = predicted[1:] - predicted[0]
+        change = np.where(self.observed & valid[1:, None, None, None], change, 0.0)
+        change[n:] /= of_starts[:, None, None, None]
+        if n and axes is None:
+            change[:n] /= np.diag(moves)[:, None, None, None]
+        elif n:
+            change[:n] = np.tensordot(np.linalg.inv(moves), change[:n], axes=1)
+        jacobian = change
         residual = np.where(self.observed, self.measured - predicted[0], 0.0)
         return Linearisation(residual, np.moveaxis(jacobian, 0, -1), bool(valid[0]))
 
@@ -434,3 +440,12 @@ class Windows:
         flat = residual.reshape(len(residual), -1, len(self.channels))
         parts = [whiten(flat[..., c], s, float(noise.sd[c]), float(noise.tau[c])) for c, s in enumerate(self.sequences)]
         return np.asarray(sum((p**2).sum(-1) for p in parts))
+
+
+def inward(theta: FloatArray, ways: FloatArray) -> FloatArray:
+    """Changes (K, N) of theta (N,), each to the side that the unit cube leaves more room for, and no longer than it."""
+    room = np.where(ways > 0, 1 - theta, theta), np.where(ways > 0, theta, 1 - theta)
+    shares = [(side / np.maximum(np.abs(ways), 1e-300)).min(1) for side in room]
+    sign = np.where((shares[0] >= 1) | (shares[0] >= shares[1]), 1.0, -1.0)
+    share = np.minimum(np.where(sign > 0, *shares), 1.0)
+    return np.asarray((sign * np.where(share > 0, share, 1.0))[:, None] * ways)

@@ -79,6 +79,7 @@ class Here:
         damping: of the next step.
         iteration: steps until now.
         scale: (N + D,), lengths of the finite differences.
+        axes: (N, N), rows along which theta is changed for them; empty before they are known.
         residual: (K, L, C), of the part's K segments; None where they are to be simulated.
         starts_jacobian: (K, L, C, D), kept; None where it is to be taken anew.
         misfit: of the first residuals, in units of the channels' spread.
@@ -94,6 +95,7 @@ class Here:
     damping: float
     iteration: int = 0
     scale: FloatArray = field(default_factory=lambda: np.zeros(0))
+    axes: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     residual: FloatArray | None = None
     starts_jacobian: FloatArray | None = None
     misfit: float = 0.0
@@ -291,12 +293,29 @@ class SegmentSolver:
         known = view.start_precision if starts is None else starts
         return np.concatenate([of_theta, np.clip(_DIFFERENCE / np.sqrt(np.maximum(known, 1e-12)), 1e-7, 1e-2)])
 
+    def _axes(self, view: Windows, theta: FloatArray, hessian: FloatArray, scale: FloatArray) -> FloatArray:
+        """Rows (N, N) along which theta (N,) is changed for the next differences: the posterior's principal axes.
+
+        Each is as long as a part of the posterior's sd along it, so that slopes are those of the posterior's width.
+        Parameters near a bound, and those whose differences are long anyway, are changed by themselves, by ``scale``.
+        """
+        length = np.maximum(scale[: len(theta)], view.least_steps(theta))
+        axes = np.diag(length)
+        free = np.flatnonzero((view.least_steps(theta) == 0) & (np.minimum(theta, 1 - theta) > 3 * length))
+        if len(free):
+            values, vectors = np.linalg.eigh(hessian[np.ix_(free, free)])
+            sd = _DIFFERENCE / np.sqrt(np.maximum(values, 1e-12))
+            longest = 0.02 / np.abs(vectors).max(0)
+            axes[np.ix_(free, free)] = (vectors * np.clip(sd, 1e-6, longest)).T
+        return axes
+
     def _plain(self, state: SolverState) -> SolverState:
         here, (keep, view) = state.here, self._view(state.here.part)
         n, starts, before = view.num_theta, view.no_starts(), lent(self.windows, view)
         try:
             scale = self._lengths(view, here)
-            lin = view.linearise(here.theta, starts, with_starts=False, residual=here.residual, theta_step=scale[:n])
+            axes = here.axes if len(here.axes) else None
+            lin = view.linearise(here.theta, starts, True, False, here.residual, scale[:n], axes=axes)
             noise = present_noise(view, lin.residual)
             rows = (lin.jacobian / noise.sd[:, None]).reshape(-1, n)
             precision, pull = rows.T @ rows, rows.T @ (lin.residual / noise.sd).ravel()
@@ -315,7 +334,8 @@ class SegmentSolver:
         )
         best, after = int(energies.argmin()), replace(here, iteration=here.iteration + 1)
         gained, damping = energy - float(energies[best]), float(here.damping * _DAMPINGS[best])
-        after = replace(after, scale=self._scaled(view, precision, None), noise=noise)
+        scale = self._scaled(view, precision, None)
+        after = replace(after, scale=scale, axes=self._axes(view, here.theta, hessian, scale), noise=noise)
         after = replace(after, misfit=here.misfit or misfit(view, lin.residual))
         if gained > 0:
             after = replace(after, theta=thetas[best], residual=residuals[best], damping=self._damped(damping))
@@ -383,7 +403,7 @@ class SegmentSolver:
                 view, moments, noise, here.theta, here.starts[keep], self.prior, not here.white, held=False
             )
             tolerance = self.tuning.tolerance * max(view.num_theta, 1) * state.wider
-            trial, hessian = self._tried(view, here, lin, moments, noise, here.starts[keep], tolerance)
+            trial, lengths = self._tried(view, here, lin, moments, noise, here.starts[keep], tolerance)
         finally:
             counted(self.windows, view, before)
         after = replace(
@@ -391,7 +411,8 @@ class SegmentSolver:
             iteration=here.iteration + 1,
             noise=noise,
             exact=abs(trial.gained - trial.expected) < 0.05 * trial.expected,
-            scale=scale if hessian is None else hessian,
+            scale=scale if lengths is None else lengths[0],
+            axes=here.axes if lengths is None else lengths[1],
             misfit=here.misfit or misfit(view, lin.residual),
         )
         small = trial.expected < tolerance or (trial.gained < tolerance and here.damping <= 1.0)
@@ -448,11 +469,12 @@ class SegmentSolver:
     def _linearised(self, view: Windows, here: Here, starts: FloatArray) -> tuple[Linearisation, bool, FloatArray]:
         """Linearisation of a part, whether all of it is new, and the lengths of its differences."""
         scale, n = self._lengths(view, here), view.num_theta
+        axes = here.axes if len(here.axes) else None
         if here.starts_jacobian is not None:
-            lin = view.linearise(here.theta, starts, True, False, here.residual, scale[:n])
+            lin = view.linearise(here.theta, starts, True, False, here.residual, scale[:n], axes=axes)
             both = np.concatenate([lin.jacobian, here.starts_jacobian * view.observed[..., None]], axis=-1)
             return replace(lin, jacobian=both), False, scale
-        lin = view.linearise(here.theta, starts, True, True, here.residual, scale[:n], scale[n:])
+        lin = view.linearise(here.theta, starts, True, True, here.residual, scale[:n], scale[n:], axes)
         return lin, True, scale
 
     def _tried(
@@ -464,7 +486,7 @@ class SegmentSolver:
         noise: Noise,
         starts: FloatArray,
         tolerance: float,
-    ) -> tuple[_Trial, FloatArray | None]:
+    ) -> tuple[_Trial, tuple[FloatArray, FloatArray] | None]:
         """The best of a batch of damped steps of theta and the initial states, and lengths of the next differences."""
         energy, n = WindowEnergy(view, noise, self.prior), view.num_theta
         normal = moments.normal(noise)
@@ -481,7 +503,8 @@ class SegmentSolver:
                 expected = float(gradient @ move - 0.5 * move @ hessian @ move) + 0.5 * solved.explained
                 own = normal[:, n : n + view.num_start, n : n + view.num_start]
                 diagonal = np.median(np.diagonal(own, axis1=1, axis2=2), axis=0) if view.num_start else np.zeros(0)
-                scale = self._scaled(view, solved.precision, view.start_precision + diagonal)
+                lengths = self._scaled(view, solved.precision, view.start_precision + diagonal)
+                scale = lengths, self._axes(view, here.theta, hessian, lengths)
                 if expected < tolerance:
                     return _Trial(here.theta, starts, lin.residual, 0.0, expected, here.damping), scale
             thetas.append(theta)

@@ -90,7 +90,7 @@ def measurement_sd(simulator: Simulator, trajectories: Trajectories) -> tuple[Fl
 
     It is infinite where nothing measures a coordinate.
 
-    What local quadratics over twice as many samples differ from the usual ones, root mean square, times three: that holds
+    What local quadratics over twice as many samples differ from the usual ones, root mean square, times 3: that holds
     noise and what smoothing bends, and is safe at the ends of a log, where a quadratic is least sure.
     """
     model = simulator.model
