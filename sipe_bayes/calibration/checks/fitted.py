@@ -54,7 +54,7 @@ def with_wild(problem: Problem, method: Estimator) -> list[LogReport]:
     return [replace(report, wild=dict(counts[report.name])) for report in problem.reports]
 
 
-_LINEARISED = 4000  # control steps of the windows that are linearised for the checks
+_LINEARISED = 2000  # control steps of the windows that are linearised for the checks
 
 
 @dataclass(frozen=True)

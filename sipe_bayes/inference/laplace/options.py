@@ -138,7 +138,7 @@ class SolverTuning(Options):
 
     damping: float = option(1e-3, "of the first step: nearly Gauss and Newton's", above=0)
     tolerance: float = option(0.05, "gain of a step below which the fit has converged", "nats a parameter", above=0)
-    plain_gain: float = option(2.0, "gain of a step below which the plain fit has converged", "nats", above=0)
+    plain_gain: float = option(0.5, "the same of the plain fit", "nats a parameter", above=0)
     most_steps: int = option(60, "steps from one starting point", least=2)
     most_points: int = option(6, "starting points, with those found on the way", least=1)
     linearised_steps: float = option(5e5, "physics steps of a linearisation, until the fit has nearly converged")

@@ -341,7 +341,7 @@ class SegmentSolver:
             after = replace(after, theta=thetas[best], residual=residuals[best], damping=self._damped(damping))
         else:
             after = replace(after, residual=lin.residual, damping=self._damped(damping * _DAMPINGS[-1]))
-        enough = self.tuning.plain_gain * (10.0 if here.part == 0 and self._next_part(Stage.PLAIN, 0) else 1.0)
+        enough = self.tuning.plain_gain * n * (10.0 if here.part == 0 and self._next_part(Stage.PLAIN, 0) else 1.0)
         stuck = gained <= 0 and here.damping >= 1.0
         if (gained > enough or (gained <= 0 and not stuck)) and after.iteration < self.tuning.most_steps:
             return replace(state, here=after)
