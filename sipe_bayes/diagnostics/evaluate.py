@@ -30,7 +30,7 @@ _NARROW, _FEW_DRAWS = 0.05, 16  # sd of the cube to which the band is to first o
 _SHORTER = (1.0, 0.5, 0.2, 0.05)  # steps of the starts that are tried, the next where one led uphill
 _SETTLED = 1e-3  # of the sum of squares: a step of the starts that gained less was the last
 _ITERATIONS = 2  # in which starts are looked for, near the measured ones
-_LOOKED_AT = 2000  # control steps that say whether measured starts make most of an error
+LOOKED_AT = 2000  # control steps that say whether measured starts make most of an error
 _AT_LIMIT = 1e-3  # relative: so near to it a correlation time is the longest that may be
 _PIECES = 10  # of a log: errors of neighbouring samples are not independent, of tenths nearly so
 
@@ -108,7 +108,7 @@ def compare_errors(
         square = np.concatenate([_squares(windows, theta[None]), _squares(others, at[None])])
     else:
         square = _off(windows, predicted)
-    some = spread_windows(windows, _LOOKED_AT, every_log=True)
+    some = spread_windows(windows, LOOKED_AT, every_log=True)
     share = _share_of_starts(windows, square[0][some], _best_squares(windows.part(some), theta))
     by_starts = share > THRESHOLDS.starts_rule
     if by_starts or fit_starts:

@@ -166,6 +166,12 @@ class Windows:
         return self.slope_precision if self.settings.noise == "ar1" else self.measured_precision
 
     @cached_property
+    def rates_measured(self) -> bool:
+        """Whether measurements tell the velocity of each degree of freedom where a window starts."""
+        rates = slice(self.simulator.model.nv, 2 * self.simulator.model.nv)
+        return bool((self.measured_precision[rates] > self.weak_precision[rates]).all())
+
+    @cached_property
     def grows(self) -> bool:
         """Whether bodies tumble or strike something, or slip on it; with starts to estimate.
 
@@ -403,8 +409,8 @@ class Windows:
         wrong = [j for j in range(n) if not valid[j + 1]]
         # a step across a physical limit: look the other way
         if wrong and valid[0]:
-            rows, moves[wrong] = np.array(wrong) + 1, -moves[wrong]
-            again = np.clip(theta + moves[wrong], 0, 1)
+            rows, again = np.array(wrong) + 1, np.clip(theta - moves[wrong], 0, 1)
+            moves[wrong] = np.where(np.abs(again - theta) > 0, again - theta, -moves[wrong])
             predicted[rows], valid[rows] = self.predict(again, all_starts[: len(wrong)], True)
         predicted[1:] = self.continued(predicted[1:], predicted[0])
         with np.errstate(invalid="ignore"):
@@ -445,7 +451,7 @@ class Windows:
 def inward(theta: FloatArray, ways: FloatArray) -> FloatArray:
     """Changes (K, N) of theta (N,), each to the side that the unit cube leaves more room for, and no longer than it."""
     room = np.where(ways > 0, 1 - theta, theta), np.where(ways > 0, theta, 1 - theta)
-    shares = [(side / np.maximum(np.abs(ways), 1e-300)).min(1) for side in room]
+    shares = [np.where(ways == 0, np.inf, side / np.maximum(np.abs(ways), 1e-300)).min(1) for side in room]
     sign = np.where((shares[0] >= 1) | (shares[0] >= shares[1]), 1.0, -1.0)
     share = np.minimum(np.where(sign > 0, *shares), 1.0)
     return np.asarray((sign * np.where(share > 0, share, 1.0))[:, None] * ways)

@@ -16,7 +16,7 @@ from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.agreement import LogEstimates, linear_estimates, log_estimates, parts_of
-from sipe_bayes.diagnostics.evaluate import best_starts, channel_noise, white_noise
+from sipe_bayes.diagnostics.evaluate import LOOKED_AT, best_starts, channel_noise, white_noise
 from sipe_bayes.diagnostics.records import ChannelNoise, LogReport
 from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.inference.base import Estimator
@@ -52,9 +52,6 @@ def with_wild(problem: Problem, method: Estimator) -> list[LogReport]:
     for log, _, channel in method.wild:
         counts[problem.train.names[log]][problem.environment.channels[channel]] += 1
     return [replace(report, wild=dict(counts[report.name])) for report in problem.reports]
-
-
-_LINEARISED = 2000  # control steps of the windows that are linearised for the checks
 
 
 @dataclass(frozen=True)
@@ -101,7 +98,7 @@ class Fit:
     @functools.cached_property
     def some(self) -> IntArray:
         """Numbers (K,) of the windows that are linearised: all, or of long logs some, spread evenly over each."""
-        return spread_windows(self.windows, _LINEARISED, every_log=True)
+        return spread_windows(self.windows, LOOKED_AT, every_log=True)
 
     @functools.cached_property
     def lin(self) -> Linearisation | None:

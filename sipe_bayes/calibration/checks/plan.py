@@ -12,15 +12,15 @@ import numpy as np
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.diagnostics.agreement import LOG_BUDGET
-from sipe_bayes.diagnostics.evaluate import band_cost, starts_cost
+from sipe_bayes.diagnostics.evaluate import LOOKED_AT, band_cost, starts_cost
 from sipe_bayes.diagnostics.identifiability import GRID
+from sipe_bayes.diagnostics.misfit.probed_logs import steps_of
 from sipe_bayes.diagnostics.prior_predictive import PREDICTIVE
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.laplace.estimator import Laplace, LaplaceState
-from sipe_bayes.inference.laplace.forecast import usual_rest, usual_rollouts
+from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.forecast import usual_rollouts
 from sipe_bayes.inference.laplace.windows.followed import followed_cost
 from sipe_bayes.inference.laplace.windows.growing_windows import grows
-from sipe_bayes.inference.laplace.windows.state import WindowState
 from sipe_bayes.inference.recorded import Progress, Tell
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import StateSpace
@@ -111,21 +111,27 @@ def plan_of(problem: Problem, method: Estimator) -> Plan:
     chain = isinstance(problem.likelihood, StateSpace)
     known = chain or isinstance(method, Laplace)
     lin = (1 + n + windows.num_start) * logs
+    theta, steps = np.clip(problem.environment.space.default_theta, 0, 1), float(windows.steps.sum())
+
+    def share(most: float) -> float:
+        """Of the windows that a check looks at, so many control steps at most."""
+        return min(1.0, most / steps)
+
     search, chosen = starts_cost(windows), grows(windows) and not known  # which windows are followed
     try:
-        lacking = 0 if chain else probes_cost(windows, np.clip(problem.environment.space.default_theta, 0, 1))
+        lacking = 0 if chain else round(probes_cost(windows, theta) * share(steps_of(windows, theta)))
     except ValueError:  # the model as given diverges, which the check will say
         lacking = 0
     alone = min(int(usual_rollouts(n + windows.num_start, logs)), LOG_BUDGET * logs)
     return {
         Check.STARTS: 0 if known else 2 * search,
-        Check.LOGS: (alone if chain else lin) if logs > 1 and not grows(windows) else 0,
-        Check.LACKING: lacking if chain else lacking + (followed_cost(windows) if chosen else lin + logs),
+        Check.LOGS: (alone if chain else round(lin * share(LOOKED_AT))) if logs > 1 and not grows(windows) else 0,
+        Check.LACKING: lacking if chain else lacking + (followed_cost(windows) if chosen else logs),
         Check.PREDICTIONS: 2 * (logs + held),
-        Check.COMPARISON: 2 * search * (logs + held) // logs,
-        Check.PRIOR: PREDICTIVE.simulations * logs,
+        Check.COMPARISON: round(search * share(LOOKED_AT) * (logs + held)) // logs,
+        Check.PRIOR: round(PREDICTIVE.simulations * logs * share(PREDICTIVE.steps)),
         Check.BANDS: band_cost(windows) * (logs + held) // logs,
-        Check.RANGES: 2 * len(GRID) * n * logs,
+        Check.RANGES: round(len(GRID) * n * logs * share(LOOKED_AT)),
     }
 
 
@@ -133,19 +139,8 @@ def with_checks(progress: Progress, plan: Plan, method: Estimator, logs: int) ->
     """The progress of a fit to so many logs that the checks come after."""
 
     def of_fit(what: str, done: int, total: int) -> None:
-        rest = _usual_rest(method, logs)
+        rest = method.usual_rest() if isinstance(method, Laplace) else None
         expected = total if rest is None else min(done + round(rest), max(total, done))
         progress(f"{what} (then checks)", done, expected + sum(plan.values()))
 
     return of_fit
-
-
-def _usual_rest(method: Estimator, logs: int) -> float | None:
-    """Rollouts that a fit will still need as a rule; None where nothing is known of that."""
-    state = method.state
-    if not isinstance(method, Laplace) or not isinstance(state, LaplaceState):
-        return None
-    if not isinstance(state.search, WindowState):
-        return None
-    drawn = 0 if state.draws is None else len(state.draws.values)
-    return usual_rest(state.search, drawn, state.search.points.shape[1] + method.num_start, logs)

@@ -17,8 +17,9 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import importance
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.importance import Draws, Judgement
+from sipe_bayes.inference.laplace.forecast import usual_rest
 from sipe_bayes.inference.laplace.options import LaplaceOptions
-from sipe_bayes.inference.laplace.solver import SolverState
+from sipe_bayes.inference.laplace.solver import SegmentSolver, SolverState
 from sipe_bayes.inference.laplace.state_space.chain_draws import blur, draws_size, looked_beyond
 from sipe_bayes.inference.laplace.state_space.known_starts import KnownStartSearch, KnownStartState
 from sipe_bayes.inference.laplace.state_space.noise import excess
@@ -367,6 +368,16 @@ class Laplace(Estimator[LaplaceState]):
         ends = np.cumsum(length + 1)
         sample = np.minimum(np.arange(int(length.max()) + 1), length[:, None])
         return np.asarray(best.states[(ends - length - 1)[:, None] + sample])
+
+    def usual_rest(self) -> float | None:
+        """Rollouts that the fit still takes as a rule; None where nothing is known of that."""
+        state, bound = self.state, self._bound
+        if state is None or bound is None or not isinstance(state.search, WindowState):
+            return None
+        if isinstance(state.search, SolverState):
+            return SegmentSolver(self.problem, self.windows(bound[0])).usual_rest(state.search)
+        drawn = 0 if state.draws is None else len(state.draws.values)
+        return usual_rest(state.search, drawn, len(self.space) + self.num_start, len(bound[0]))
 
     @property
     def wild(self) -> IntArray:

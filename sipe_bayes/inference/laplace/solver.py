@@ -51,7 +51,7 @@ from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION
 from sipe_bayes.likelihood.restricted import eliminate_starts, marginal
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.wild_samples import wild_residuals
-from sipe_bayes.likelihood.windows import Linearisation, Windows
+from sipe_bayes.likelihood.windows import Linearisation, Windows, inward
 
 _DAMPINGS = np.array([0.03, 1.0, 30.0, 1000.0])  # tried together, times the damping of the step before
 _DIFFERENCE = 0.3  # conditional posterior sds that a finite difference is long
@@ -201,10 +201,23 @@ class SegmentSolver:
         windows = self.windows
         fixed = windows.fixed_sd
         sd = np.where(np.isnan(fixed), np.maximum(0.1 * windows.spread, windows.rounding), fixed)
-        stage = Stage.PLAIN if windows.starts_measured else Stage.FIT
+        stage = Stage.PLAIN if windows.starts_measured or windows.rates_measured else Stage.FIT
         noise = Noise(sd, np.zeros(len(sd)))
         white = windows.settings.noise != "ar1"
         return Here(stage, 0, theta, windows.no_starts(), noise, self.tuning.damping, white=white)
+
+    def usual_rest(self, state: SolverState) -> float:
+        """Rollouts that a fit still takes as a rule, by the steps that real arms and servos took of each stage."""
+        windows, here = self.windows, state.here
+        n, d, logs = windows.num_theta, windows.num_start, len(windows.trajectories)
+        course = [(Stage.PLAIN, 0, 6), (Stage.PLAIN, 1, 6), (Stage.FIT, 1, 4), (Stage.FIT, 2, 4)]
+        look = 0.0 if state.behind_noise or state.done else 2.0 * (1 + 4 * n)  # at what lies beyond the normal
+        now = next((k for k, (stage, part, _) in enumerate(course) if (stage, part) == (here.stage, here.part)), 3)
+        for k, (stage, part, steps) in enumerate(course[now:] if not state.done else ()):
+            columns = n + (d if stage is Stage.FIT else 0) + len(_DAMPINGS)
+            new = part == 0 or self._share(part - 1) < 1 or stage is not course[max(now + k - 1, 0)][0]
+            look += steps * (0.5 if k == 0 else 1.0) * columns * min(self._share(part), 1.0) * new
+        return look * logs
 
     # Parts of the segments
 
@@ -309,12 +322,21 @@ class SegmentSolver:
             axes[np.ix_(free, free)] = (vectors * np.clip(sd, 1e-6, longest)).T
         return axes
 
+    def _usable(self, here: Here) -> FloatArray | None:
+        """The axes of the differences; None where theta has come so near to a bound that they have no room there."""
+        if not len(here.axes):
+            return None
+        moves = inward(here.theta, here.axes)
+        short = np.linalg.norm(moves, axis=1) < 0.05 * np.linalg.norm(here.axes, axis=1)
+        outside = ((here.theta + moves < 0) | (here.theta + moves > 1)).any(1)
+        return None if (short | outside).any() else here.axes
+
     def _plain(self, state: SolverState) -> SolverState:
         here, (keep, view) = state.here, self._view(state.here.part)
         n, starts, before = view.num_theta, view.no_starts(), lent(self.windows, view)
         try:
             scale = self._lengths(view, here)
-            axes = here.axes if len(here.axes) else None
+            axes = self._usable(here)
             lin = view.linearise(here.theta, starts, True, False, here.residual, scale[:n], axes=axes)
             noise = present_noise(view, lin.residual)
             rows = (lin.jacobian / noise.sd[:, None]).reshape(-1, n)
@@ -469,7 +491,7 @@ class SegmentSolver:
     def _linearised(self, view: Windows, here: Here, starts: FloatArray) -> tuple[Linearisation, bool, FloatArray]:
         """Linearisation of a part, whether all of it is new, and the lengths of its differences."""
         scale, n = self._lengths(view, here), view.num_theta
-        axes = here.axes if len(here.axes) else None
+        axes = self._usable(here)
         if here.starts_jacobian is not None:
             lin = view.linearise(here.theta, starts, True, False, here.residual, scale[:n], axes=axes)
             both = np.concatenate([lin.jacobian, here.starts_jacobian * view.observed[..., None]], axis=-1)
@@ -639,7 +661,7 @@ class SegmentSolver:
         return replace(state, optima=early[-1:], here=here)
 
     def free_run_ratio(self, theta: FloatArray, plain: FloatArray) -> float:
-        """How many times the free-run error of ``plain`` (N,) that of theta (N,) is; geometric mean over channels.
+        """How many times the free-run error of ``plain`` (N,) that of theta (N,) is: geometric mean of all logs.
 
         Each training log is one simulation from the measured first state; where theta is worse from there, from the one
         that fits best. Where that follows no log, as in chaotic motion, the segments stand in its place.
@@ -648,15 +670,17 @@ class SegmentSolver:
         settings = replace(windows.settings, window=None, windows=(), noise="white", seconds=None)
         for view in (Windows(settings, windows.simulator, windows.trajectories), windows):
             view, starts = copy.copy(view), np.tile(view.no_starts(), (2, 1, 1))
-            view.start_precision = view.weak_precision  # a whole log tells where it began
+            view.start_precision = view.measured_precision  # else an initial state hides what parameters should explain
             for _ in range(2):
                 windows.spend(2)
                 residual, valid = view.residuals(np.stack([theta, plain]), starts)
-                sizes = np.stack([present_noise(view, r).sd for r in residual])
-                moving = (view.spread > 0) & np.isnan(view.fixed_sd)
-                if not valid.all() or not (sizes[1] < 0.5 * view.spread)[moving].all():
+                sizes = np.stack([_log_errors(view, r) for r in residual])
+                moving = np.isfinite(sizes).all(0) & (sizes > view.rounding).all(0) & np.isnan(view.fixed_sd)
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    follows, ratios = np.log(sizes[1] / view.spread)[moving], np.log(sizes[0] / sizes[1])[moving]
+                if not valid.all() or not moving.any() or follows.mean() > np.log(0.5):
                     break
-                ratio = float(np.exp(np.log(sizes[0] / sizes[1])[moving].mean()))
+                ratio = float(np.exp(ratios.mean()))
                 if ratio <= _WORSE or starts.any():
                     return ratio
                 starts = np.stack([self._best_starts(view, at) for at in (theta, plain)])
@@ -668,6 +692,16 @@ class SegmentSolver:
         lin = view.linearise(theta, view.no_starts(), with_theta=False)
         moments, noise = view.moments(lin, white=True), present_noise(view, lin.residual)
         return marginal(moments, noise, view.no_starts(), view.start_precision)[1]
+
+
+def _log_errors(view: Windows, residual: FloatArray) -> FloatArray:
+    """Root mean squares (logs, C) of a residual (W, L, C); NaN where a log has no sample."""
+    out = np.full((len(view.trajectories), residual.shape[-1]), np.nan)
+    for log in np.unique(view.log):
+        count = view.observed[view.log == log].sum((0, 1))
+        square = (residual[view.log == log] ** 2).sum((0, 1))
+        out[log] = np.where(count > 0, np.sqrt(square / np.maximum(count, 1)), np.nan)
+    return out
 
 
 def spread_segments(log: IntArray, share: float) -> IntArray:

@@ -104,7 +104,7 @@ def summarised(problem: SearchProblem, windows: Windows, ending: Ending) -> Wind
     for weight, point in noise_cloud(moments, noise, here, free_noise(windows), windows.trajectories.longest):
         if sandwiched:
             middle = sandwich(ending.jacobian, solved.slope, white, windows.sequences, point)
-            centre, spread = problem.normal(theta, *_sandwiched(solved, middle))
+            centre, spread = problem.normal(theta, *_sandwiched(solved, middle, here.free))
         else:
             point = beyond_rounding(windows, point)
             inner = eliminate_starts(moments.normal(point), moments.num_theta, windows.start_precision, start_pull)
@@ -122,9 +122,13 @@ def sandwiches(windows: Windows) -> bool:
     return windows.settings.noise == "sandwich"
 
 
-def _sandwiched(solved: Eliminated, middle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Precision and gradient of plain least squares when the residuals' covariance gives ``middle`` (N, N)."""
-    shift = np.linalg.pinv(solved.precision, rcond=1e-12, hermitian=True) @ solved.gradient
+def _sandwiched(solved: Eliminated, middle: FloatArray, free: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Precision and gradient of plain least squares when the residuals' covariance gives ``middle`` (N, N).
+
+    Parameters that a bound holds, not ``free`` (N,), stay there: the sandwich does not say where others would follow.
+    """
+    shift, inner = np.zeros(len(free)), solved.precision[np.ix_(free, free)]
+    shift[free] = np.linalg.pinv(inner, rcond=1e-12, hermitian=True) @ solved.gradient[free]
     precision = solved.precision @ np.linalg.pinv(middle, rcond=1e-12, hermitian=True) @ solved.precision
     # rounding leaves some of an open direction negative
     eigenvalues, axes = np.linalg.eigh(0.5 * (precision + precision.T))
