@@ -67,6 +67,7 @@ def calibrate(
     progress: Progress | None = None,
     time_limit: float | None = None,
     keep: Callable[[Calibration], object] | None = None,
+    announce: Callable[[str], None] | None = None,
 ) -> Calibration:
     """Fit, check and summarise. An exception in a check is one of the result's ``findings``, and loses nothing else.
 
@@ -80,10 +81,12 @@ def calibrate(
         time_limit: s, after which the search ends with its best estimate and checks are skipped; default none. The
             same call with another limit resumes.
         keep: called with the result of the fit alone, as soon as there is one.
+        announce: called with a first estimate in words, long before that.
     """
     began = time.monotonic()
     method = method_of(problem, estimator, seed, budget, checkpoint, progress)
     method.time_limit = math.inf if time_limit is None else at_least("time_limit", time_limit, 0)
+    method.announce = announce or method.announce
     guard, plan = Guard(began + method.time_limit), NO_PLAN
     if progress is not None:
         plan = guard.run("forecast", lambda: plan_of(problem, method)).otherwise(plan)
@@ -330,7 +333,8 @@ def run(
         num_threads: native ones; default all cores.
         progress: called along the way.
         device: that it simulates on, as ``Simulator`` has them.
-        tell: called with a line for what no simulation follows and what no body has, before the fit takes its time.
+        tell: called with a line for what no simulation follows and what no body has, before the fit takes its time, and
+            for a first estimate.
         time_limit: s of fit and checks, as of ``calibrate``.
 
     Raises:
@@ -358,7 +362,7 @@ def run(
             write_fit(replace(first, run=record, out=str(folder)), folder, Guard())
 
         settings = name, chosen_seed, chosen_budget, folder / CHECKPOINT, progress, time_limit
-        calibration = replace(calibrate(problem, *settings, keep), run=record, out=str(folder))
+        calibration = replace(calibrate(problem, *settings, keep, tell), run=record, out=str(folder))
         if progress is not None:
             progress("writing the report", calibration.rollouts, calibration.rollouts)
         return write_all(calibration, problem, folder)

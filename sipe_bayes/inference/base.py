@@ -12,7 +12,7 @@ import json
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -30,7 +30,7 @@ from sipe_bayes.core.validation import MOST_ROLLOUTS, flag, path, whole
 from sipe_bayes.datasets.demonstrations import Given
 from sipe_bayes.inference.arguments import check_comparison, check_named, check_simulator, stated_prior
 from sipe_bayes.inference.device_findings import device_findings, differentiable
-from sipe_bayes.inference.recorded import Progress, Recorded, at_bounds, digest
+from sipe_bayes.inference.recorded import Progress, Recorded, at_bounds, digest, silent
 from sipe_bayes.likelihood.binding import bind, default_likelihood
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, Segments, StateSpace
 from sipe_bayes.likelihood.state_space.chain import Chain
@@ -162,6 +162,7 @@ class Estimator(ABC, Generic[S]):
         self.checkpoint, self.progress = self.stored("checkpoint", checkpoint), progress
         self.rollouts, self.findings = 0, Findings()
         self.diagnostics: dict[str, Any] = {}
+        self.announce: Callable[[str], None] = silent  # gets a first estimate in words, as soon as there is one
         self._last: Snapshot[S] | None = None
         self._run = ""  # fingerprint of the run that it belongs to
         self._bound: tuple[Trajectories, Windows | Chain] | None = None

@@ -45,7 +45,6 @@ from sipe_bayes.posterior.truncated_normal import interval_quantile
 
 _FARTHEST = 40.0  # times the prior's scale: a spread beyond
 _FEW = 0.02  # share of mu in the cube, below which tau is sampled together with it
-_MOST_WORK = 3e8  # of the walkers' steps, times the cube of the dimensions: 30 of them take some seconds
 _MIDDLE = 3.0  # precision around the cube's middle, by which mu is drawn and which the draws' weights take away again
 
 
@@ -233,7 +232,8 @@ def _walked(
     state = emcee.State(start, random_state=np.random.RandomState(seed).get_state())
     moves = [(emcee.moves.DEMove(), 0.8), (SnookerMove(), 0.2)]
     sampler = emcee.EnsembleSampler(walkers, size, density, vectorize=True, moves=moves)
-    share = min(1.0, _MOST_WORK / (walkers * size**3 * (options.warmup + options.steps)))
+    # of the walkers' steps, times the cube of the dimensions: 30 of them take some seconds
+    share = min(1.0, 3e8 / (walkers * size**3 * (options.warmup + options.steps)))
     warmup, steps = math.ceil(share * options.warmup), max(math.ceil(share * options.steps), 10)
     sampler.run_mcmc(state, warmup + steps)
     chain: FloatArray = sampler.get_chain(discard=warmup, thin=10, flat=True)

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import re
 import sys
 
-import numpy as np
 import pytest
 
 import sipe_bayes as sipe
 from sipe_bayes.calibration.checks.plan import Check, Checks
 from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
-from sipe_bayes.inference.laplace.forecast import usual_rest, usual_rollouts
-from sipe_bayes.inference.laplace.windows.state import Phase, Position, WindowState
 from sipe_bayes.inference.recorded import Tell
-from sipe_bayes.likelihood.noise import Noise
 
 PLAN = {Check.LOGS: 200, Check.RANGES: 50}
 
@@ -88,15 +83,3 @@ def test_the_forecast_is_right_within_a_factor_of_two(course: str, monkeypatch: 
     print(ratios)
     assert len(ratios) > 5
     assert all(0.5 < ratio < 2 for ratio in ratios.values())
-
-
-def test_less_is_to_come_the_farther_a_search_is() -> None:
-    here = Position(Phase.ROUGH, np.zeros(3), np.zeros((1, 2)), Noise(np.ones(1), np.zeros(1)), 1.0, 0.1)
-    begun = WindowState(np.zeros((2, 3)), 0, here)
-    states = [begun, dataclasses.replace(begun, here=dataclasses.replace(here, iteration=20))]
-    states.append(dataclasses.replace(begun, point=1))
-    rest = [usual_rest(state, 0, 5, logs=2) for state in states]
-    rest += [usual_rest(states[-1], drawn, 5, logs=2) for drawn in (50, 250, 1000)]
-    assert rest == sorted(rest, reverse=True)
-    assert rest[0] == usual_rollouts(5, logs=2, starts=2)
-    assert rest[-1] > 0, "a search that is longer than usual still goes on"

@@ -18,7 +18,6 @@ from sipe_bayes.diagnostics.misfit.probed_logs import steps_of
 from sipe_bayes.diagnostics.prior_predictive import PREDICTIVE
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.forecast import usual_rollouts
 from sipe_bayes.inference.laplace.windows.followed import followed_cost
 from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.inference.recorded import Progress, Tell
@@ -122,7 +121,7 @@ def plan_of(problem: Problem, method: Estimator) -> Plan:
         lacking = 0 if chain else round(probes_cost(windows, theta) * share(steps_of(windows, theta)))
     except ValueError:  # the model as given diverges, which the check will say
         lacking = 0
-    alone = min(int(usual_rollouts(n + windows.num_start, logs)), LOG_BUDGET * logs)
+    alone = min(30 * (n + windows.num_start + 2) + 600, LOG_BUDGET) * logs
     return {
         Check.STARTS: 0 if known else 2 * search,
         Check.LOGS: (alone if chain else round(lin * share(LOOKED_AT))) if logs > 1 and not grows(windows) else 0,

@@ -17,7 +17,6 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import importance
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.importance import Draws, Judgement
-from sipe_bayes.inference.laplace.forecast import usual_rest
 from sipe_bayes.inference.laplace.options import LaplaceOptions
 from sipe_bayes.inference.laplace.solver import SegmentSolver, SolverState
 from sipe_bayes.inference.laplace.state_space.chain_draws import blur, draws_size, looked_beyond
@@ -153,6 +152,11 @@ class Laplace(Estimator[LaplaceState]):
                 raise
             return replace(self._looked_beyond(windows, judged, target), done=False)  # the next step ends it
         windows.budget = self.budget
+        before, after = (s.plain if isinstance(s, SolverState) else np.zeros(0) for s in (state.search, search))
+        if len(after) > len(before):
+            values = zip(self.space, self.space.values(after).tolist(), strict=True)
+            named = ", ".join(f"{p.name} {value:.4g} {p.unit}".rstrip() for p, value in values)
+            self.announce(f"First estimate (plain least squares, no intervals yet): {named}")
         if search.optima is not state.search.optima:
             state = replace(state, judgements=(), draws=None, looked=False, unjudged=False)
         state = replace(state, search=search)
@@ -376,8 +380,11 @@ class Laplace(Estimator[LaplaceState]):
             return None
         if isinstance(state.search, SolverState):
             return SegmentSolver(self.problem, self.windows(bound[0])).usual_rest(state.search)
+        # through impacts: 30 steps from each starting point, and 300 draws of two rollouts, at least a third of either
         drawn = 0 if state.draws is None else len(state.draws.values)
-        return usual_rest(state.search, drawn, len(self.space) + self.num_start, len(bound[0]))
+        later = len(state.search.points) - state.search.point - 1 + max(1 - state.search.here.iteration / 30, 0.3)
+        steps = 0.0 if drawn else later * 30 * (len(self.space) + self.num_start + 2)
+        return (steps + 2 * max(300 - drawn, 90)) * len(bound[0])
 
     @property
     def wild(self) -> IntArray:

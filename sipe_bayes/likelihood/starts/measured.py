@@ -15,8 +15,6 @@ from sipe_bayes.likelihood.starts.smoothing import smoothed
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import tangents
 
-_MOST_DELAYS = 256  # distinct delays whose states are kept: a search asks for a few at a time
-
 
 @dataclass
 class MeasuredStarts:
@@ -79,7 +77,7 @@ class MeasuredStarts:
             bridged = np.stack([_bridged(column) for column in log.observations.T], axis=-1)
             moved = delayed(bridged[None], -late[None, None] / log.dt, self.simulator.environment.rotations)[0]
             known = np.where(np.isfinite(log.observations).any(0), moved, np.nan)
-            if len(self._earlier) >= _MOST_DELAYS:
+            if len(self._earlier) >= 256:  # a search asks for a few at a time
                 self._earlier.clear()
             self._earlier[key] = estimate_states(self.simulator, replace(log, observations=known))
         return self._earlier[key]
