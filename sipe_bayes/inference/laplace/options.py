@@ -171,7 +171,7 @@ class LaplaceTuning(Options):
 class LaplaceOptions(Options):
     """What ``Laplace`` takes beside what every estimator takes."""
 
-    restarts: int = option(2, "starting points followed, at most: one may end in a side valley", least=1)
+    restarts: int = option(2, "starting points at most; more than one where the first fit is poor", least=1)
     candidates: int = option(8, "points among which they are chosen: draws from the prior", least=0)
     initial: FloatArray | None = option(None, "the starting points (R, N) themselves instead", "of the cube")
     tuning: LaplaceTuning = option(LaplaceTuning(), "numbers of the search itself")
