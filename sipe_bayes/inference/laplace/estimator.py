@@ -201,6 +201,8 @@ class Laplace(Estimator[LaplaceState]):
         if isinstance(search, SolverState) and search.behind_noise:
             return replace(ended, search=search)  # its interval is no likelihood's
         kept = distinct(search.optima)
+        if isinstance(search, SolverState) and search.here.exact and np.diag(kept[0].covariance).max() < 0.02**2:
+            return replace(ended, search=search)  # narrow, and as the linearisation foretold at its own width
         probe = probed(self.problem, windows, kept)
         if probe.stands:
             return replace(ended, search=search.looked_around(kept[0]))

@@ -432,7 +432,7 @@ class SegmentSolver:
             here,
             iteration=here.iteration + 1,
             noise=noise,
-            exact=abs(trial.gained - trial.expected) < 0.05 * trial.expected,
+            exact=here.exact if trial.expected < tolerance else abs(trial.gained / trial.expected - 1) < 0.05,
             scale=scale if lengths is None else lengths[0],
             axes=here.axes if lengths is None else lengths[1],
             misfit=here.misfit or misfit(view, lin.residual),
