@@ -146,7 +146,9 @@ def calibrate(
         check_least(0, seed=seed)
         check_least(1, budget=budget, threads=threads)
         check_least(0, time_limit=time_limit)
-        calibration = run(config, estimator, seed, budget, out, threads, progress, device, _say_early, time_limit)
+        calibration = run(
+            config, estimator, seed, budget, out, threads, progress, device, None if as_json else _say_early, time_limit
+        )
     discovery = None
     if discover:
         with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json, counted=False) as progress:

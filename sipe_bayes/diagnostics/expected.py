@@ -123,6 +123,7 @@ def information(
         motion.observations[0], plan.actions, plan.dt, motion.states[0], plan.name, simulator.environment.channels
     )
     windows = bind(likelihood, simulator, Trajectories.stack(log))
+    windows.start_precision = windows.weak_precision  # without noise it would seem to be measured exactly
     linearisation = windows.linearise(theta, windows.no_starts())
     if not linearisation.valid:
         return None

@@ -62,7 +62,7 @@ def prompt(simulator: Simulator, contacts: bool = True) -> Simulator:
         contacts: whether bodies may touch.
     """
     engine, model, environment = simulator.engine, simulator.model, simulator.environment
-    if simulator.device != "cpu" or environment.stepwise or environment.data_fields:
+    if type(simulator) is not Simulator or simulator.device != "cpu" or environment.stepwise or environment.data_fields:
         return simulator
     buffers = sum(2 + 2 * int(model.actuator_history[b.actuator, 0]) for b in engine.short_delays.buffers)
     if engine.laws or engine.firmware or buffers != model.nhistory or not hasattr(environment, "spec"):

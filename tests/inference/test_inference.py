@@ -79,7 +79,8 @@ def test_the_exact_posterior_of_a_linear_gaussian_system(name: str) -> None:
     """Known white noise, unknown start.
 
     The chain's mean is good to 4 of its standard errors at 300 effective draws (false-alarm rate 0.03 % for each
-    number); Laplace is exact.
+    number); Laplace is
+    exact but for the prior of the initial state, which smoothed samples tell to three times their error.
     """
     simulator = cart()
     trajectory, _ = cart_log(simulator, 1)
@@ -87,12 +88,12 @@ def test_the_exact_posterior_of_a_linear_gaussian_system(name: str) -> None:
     likelihood = Segments(None, noise="white", noise_sd=(NOISE,))
     posterior = get_estimator(simulator, name, likelihood=likelihood, seed=0, budget=6000).fit(trajectory)
     sd = np.sqrt(np.diag(covariance))
-    tolerance = 1e-3 if name == "laplace" else 4 / np.sqrt(300)
+    tolerance = 2e-2 if name == "laplace" else 4 / np.sqrt(300)
     print(name, (posterior.mean.numpy() - mean) / sd, posterior.stddev.numpy() / sd)
     np.testing.assert_allclose(posterior.mean.numpy(), mean, atol=tolerance * sd.max(), rtol=0)
-    np.testing.assert_allclose(posterior.stddev.numpy(), sd, rtol=2e-3 if name == "laplace" else 0.17)
+    np.testing.assert_allclose(posterior.stddev.numpy(), sd, rtol=2e-2 if name == "laplace" else 0.17)
     correlation = posterior.covariance.numpy()[0, 1] / np.prod(posterior.stddev.numpy())
-    assert abs(correlation - covariance[0, 1] / sd.prod()) < (2e-3 if name == "laplace" else 0.25)
+    assert abs(correlation - covariance[0, 1] / sd.prod()) < (2e-2 if name == "laplace" else 0.25)
 
 
 def test_windows_lose_no_information_that_the_starts_do_not_take() -> None:
@@ -137,11 +138,11 @@ def test_wrong_input() -> None:
         (lambda: get_estimator(simulator, "laplace", restarts=0), ValueError, "restarts"),
         (lambda: get_estimator(simulator, "mcmc", walkers=3), ValueError, "walkers"),
         (lambda: get_estimator(simulator, "mcmc", likelihood=Segments(noise="sandwich")), ValueError, "use 'ar1'"),
-        (lambda: get_estimator(simulator, "laplace", budget=12).fit(trajectory), BudgetTooSmall, "raise the budget"),
+        (lambda: get_estimator(simulator, "laplace", budget=5).fit(trajectory), BudgetTooSmall, "raise"),
         (
-            lambda: get_estimator(simulator, "mcmc", budget=12).fit(trajectory),
+            lambda: get_estimator(simulator, "mcmc", budget=5).fit(trajectory),
             BudgetTooSmall,
-            "^budget: 12 rollouts did not suffice for the laplace fit that comes first; raise it$",
+            "^budget: 5 rollouts did not suffice for the laplace fit that comes first; raise it$",
         ),
         (lambda: get_estimator(simulator, "laplace").fit(other), ValueError, "expected observations of the 1 channels"),
         (lambda: get_estimator(simulator, "laplace").fit(silent), ValueError, "no sample at all"),

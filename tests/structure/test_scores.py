@@ -11,7 +11,6 @@ import torch
 from sipe_bayes.core.arrays import BoolArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.envs.base import START_SD
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.strategy import distinct
@@ -64,7 +63,7 @@ def exact(windows: Windows, rho: float, keep: BoolArray | None = None) -> float:
     logs = windows.log[owner[rows]]
     lag = np.abs(time[:, None] - time)
     covariance = SD**2 * np.where(logs[:, None] == logs, rho**lag if rho else (lag == 0) * 1.0, 0.0)
-    sd = np.tile(np.repeat(START_SD, [1, 1, 0]), windows.num_windows)
+    sd = np.tile(windows.start_precision**-0.5, windows.num_windows)
     covariance += starts @ np.diag(sd**2) @ starts.T
     normal = scipy.stats.multivariate_normal(np.zeros(len(rows)), covariance)
     residual = lin.residual[:, :, 0].ravel()[rows]

@@ -210,7 +210,7 @@ def test_a_budget_is_a_bound_and_where_it_ends_the_search_is_not_settled() -> No
     with pytest.raises(BudgetTooSmall, match="raise"):
         discover(pendulum(), given[0], restriction=given[1], budget=1)
     cuts = []
-    for budget in (30, 60, 110, 240):
+    for budget in (50, 80, 110, 240):
         structures = discover(pendulum(), given[0], restriction=given[1], budget=budget)
         cuts.append(structures.state.cut)
         assert structures.rollouts <= budget

@@ -72,7 +72,7 @@ def test_many_logs_and_late_samples_grow_as_well() -> None:
         assert np.abs(points[0] - theta)[:2].max() < 0.1
 
 
-def test_a_model_that_diverges_as_given_is_said_to() -> None:
+def test_a_model_that_diverges_as_given_is_said_to(monkeypatch: pytest.MonkeyPatch) -> None:
     theta = np.array([0.87, 0.38, 0.5])
     estimator = Laplace(bouncing(), likelihood=KNOWN, restarts=1)
     windows = estimator.bound(Trajectories.stack([bouncing_log(theta, 0, 30)]))
@@ -85,6 +85,7 @@ def test_a_model_that_diverges_as_given_is_said_to() -> None:
         return result
 
     simulator.rollout = broken
+    monkeypatch.setattr("sipe_bayes.likelihood.windows.prompt", lambda given, contacts: given)
     points = grown(estimator.problem, windows)
     assert points is not None
     assert [item.code for item in estimator.findings] == [Code.DIVERGES_AS_GIVEN]
