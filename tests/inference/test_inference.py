@@ -176,7 +176,7 @@ def test_a_delay_of_none_is_found(likelihood: Any) -> None:
     """
     delay = Parameter("delay", 0.0, 0.05, targets=("actuator:motor.delay",))
     simulator = pendulum(delay)
-    for seed in (2, 4, 5, 7):
+    for seed in (2, 4, 7, 8):
         posterior = get_estimator(simulator, "laplace", likelihood=likelihood).fit(
             log(simulator, [0.6, 0.1, 0.0], seed, steps=200)
         )
