@@ -9,18 +9,21 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
 
 1. PLAIN: theta alone, the segments begin as measured, white noise of the residuals' present size. On a part of the
    segments first, then on as many as ``linearised_steps`` allows. Its end is the plain fit, the first answer.
-2. FIT: theta and the initial states, noise by restricted likelihood before each step; on the same part, then on all
-   segments up to ``fitted_steps``. Columns of the initial states are kept while they predict what a step gains.
+2. FIT: theta and the initial states, noise by restricted likelihood before each step; on the same part, then on
+   ``whole`` times as many segments. Columns of the initial states are kept while they predict what a step gains. The
+   first step holds plain against generalised least squares (``_noise_takes_over``).
 3. COMPARE: the plain fit and the posterior mode each run free along the whole training logs. Where the mode is worse by
-   more than 3 %, coloured noise has taken over what parameters explain. Then the estimate is that of white
-   noise, fitted again from the plain fit, and the interval is the sandwich (``likelihood.noise_spread``), which holds
-   for coloured residuals.
+   more than 3 %, coloured noise explains what parameters should. Then the estimate is that of white noise, fitted again
+   from the plain fit, and the interval is the sandwich (``likelihood.noise_spread``), which holds for coloured residuals.
 
-**Differences** are as long as a third of the conditional posterior sd of what they move, so that slopes are those of
-the posterior's width, whatever dry friction or a delay does below it.
+**Differences** of theta run along the principal axes of the posterior and are a third of its sd along each. So slopes
+are those of the posterior's width, whatever dry friction or a delay does below it.
 
 **More starting points** are followed only where the fit is poor: residuals larger than ``poor`` times what samples
 scatter by. They are the best of a few draws from the prior, fitted as in 1; the best end is kept.
+
+**Limit**: a second optimum that fits as well as the first is not looked for. Two distances of a centre of mass from its
+joint give a pendulum one period, for example; the fit then ends at the one that is nearer to the nominal model.
 
 A. Bock's multiple shooting (1981, https://doi.org/10.1007/978-3-642-67917-5_8) with initial states eliminated
 (``likelihood.block_tridiagonal``).
