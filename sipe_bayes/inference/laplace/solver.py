@@ -14,7 +14,7 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
    first step holds plain against generalised least squares (``_noise_takes_over``).
 3. COMPARE: the plain fit and the posterior mode each run free along the whole training logs. Where the mode is worse by
    more than 3 %, coloured noise explains what parameters should. Then the estimate is that of white noise, fitted again
-   from the plain fit, and the interval is the sandwich (``likelihood.noise_spread``), which holds for coloured residuals.
+   from the plain fit. The interval is the sandwich (``likelihood.noise_spread``), which holds for coloured residuals.
 
 **Differences** of theta run along the principal axes of the posterior and are a third of its sd along each. So slopes
 are those of the posterior's width, whatever dry friction or a delay does below it.
