@@ -27,7 +27,7 @@ class Contacts:
     """What the states along logs have of contact.
 
     Args:
-        touch: whether any two geoms touch.
+        touch: whether any two geoms touch, or may do so in states that are not known.
         change: whether two touch in some of the states and are clearly apart in others.
         rough: whether what touches all along slips and sticks, as a cart's wheels may: simulations jump by parameters.
     """
@@ -61,9 +61,9 @@ def contacts_along(
     looks = np.concatenate(list(logs))
     looks = looks[_spread(len(looks))]
     looks = looks[np.isfinite(looks).all(1)]
-    seen, count = _touching(model, logs if sampled is None else sampled)
+    seen, count, all_known = _touching(model, logs if sampled is None else sampled)
     change = any(_part(model, data, pair, looks) for pair, number in seen.items() if number < count)
-    return Contacts(bool(seen), change)
+    return Contacts(bool(seen) or not all_known, change)
 
 
 def jumps(simulator: Simulator, logs: Sequence[Trajectory], states: Sequence[FloatArray]) -> bool:
@@ -113,14 +113,14 @@ def _spread(count: int) -> IntArray:
     return np.linspace(0, count - 1, min(_LOOKS, count)).astype(int)
 
 
-def _touching(model: mujoco.MjModel, logs: Sequence[FloatArray]) -> tuple[Counter[tuple[int, int]], int]:
-    """In how many states each pair of geoms touches, and of how many."""
+def _touching(model: mujoco.MjModel, logs: Sequence[FloatArray]) -> tuple[Counter[tuple[int, int]], int, bool]:
+    """In how many states each pair of geoms touches, of how many, and whether all of these are known."""
     states, lengths = np.concatenate(list(logs))[:, 1 : 1 + model.nq], [len(own) for own in logs]
     first = np.repeat(np.cumsum(lengths) - lengths, lengths)  # of each state's log
     now = _spread(len(states))
     before = np.maximum(now - 1, first[now])
     finite = np.isfinite(states[now]).all(1) & np.isfinite(states[before]).all(1)
-    now, before = now[finite], before[finite]
+    all_known, now, before = bool(finite.all()), now[finite], before[finite]
     near, data, seen = copy.copy(model), mujoco.MjData(model), Counter[tuple[int, int]]()
     reach = 2 * max((_step(model, data, states[b], states[n]) for b, n in zip(before, now, strict=True)), default=0.0)
     near.geom_margin[:], near.geom_gap[:] = model.geom_margin + reach, 0.0
@@ -134,7 +134,7 @@ def _touching(model: mujoco.MjModel, logs: Sequence[FloatArray]) -> tuple[Counte
             ahead = 2 * distance - earlier.get(pair, math.inf) if b < n else distance
             if distance <= margin or (math.isfinite(ahead) and ahead <= 0):
                 seen[pair] += 1
-    return seen, len(now)
+    return seen, len(now), all_known
 
 
 def _step(model: mujoco.MjModel, data: mujoco.MjData, before: FloatArray, now: FloatArray) -> float:
