@@ -32,7 +32,6 @@ from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.records import Comparison, Signal
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.unknowns import bounded_by_nature
-from sipe_bayes.inference.laplace.windows.growing_windows import measured_starts
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.windows import Windows
@@ -170,7 +169,7 @@ class _Model:
     def predicted(self, windows: Windows) -> FloatArray:
         """Predictions (W, L, C) from measured starts."""
         theta = self.one.theta[None]
-        return windows.predict(theta, measured_starts(windows, theta))[0][0]
+        return windows.predict(theta, windows.no_starts(len(theta)))[0][0]
 
     @property
     def values(self) -> dict[str, float]:

@@ -106,12 +106,11 @@ class Marginals:
         name, others = one
         return [finding(Code.WORTH_MEASURING, parameters=[name], count=len(others), others=", ".join(others))]
 
-    def summaries(self, further: Posterior | None = None, apart: bool = False) -> list[ParameterSummary]:
+    def summaries(self, further: Posterior | None = None) -> list[ParameterSummary]:
         """One for each parameter.
 
         Args:
             further: theta with what the model lacks or may lack; its intervals hold the plain ones.
-            apart: whether they need not, since they are of a model that has what this one lacks.
         """
         mode = self.space.values(self.theta)
         beyond = None if further is None else further.quantile(torch.tensor([0.05, 0.95], dtype=torch.float64)).numpy()
@@ -127,7 +126,7 @@ class Marginals:
             ends = None
             if beyond is not None and p.log is None:
                 low, high = (float(p.value(float(end))) for end in beyond[:, j])
-                ends = (low, high) if apart else (min(low, q05), max(high, q95))
+                ends = (min(low, q05), max(high, q95))
             summaries.append(ParameterSummary(p.name, p.unit, p.targets, *marginal, ends, bool(self.known[j])))
         return summaries
 

@@ -47,7 +47,6 @@ from sipe_bayes.diagnostics.records import Mixing
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.envs.unknowns import bounded_by_nature
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.inference.recorded import Progress, digest
 from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.likelihood.binding import bind
@@ -200,9 +199,8 @@ def _described(
 ) -> Calibration:
     """The fit with what its checks say, as records and as diagnostics."""
     lacks, predictions = answers.lacks, answers.predictions
-    apart = bool(lacks.put_in)
     parameters = guard.run(
-        "summaries with what the model lacks", lambda: marginals.value.summaries(answers.further, apart)
+        "summaries with what the model lacks", lambda: marginals.value.summaries(answers.further)
     ).otherwise(first.parameters)
     ridges = guard.run("ridges", lambda: marginals.value.ridges).otherwise([])
     noise = guard.run("noise of the channels", lambda: answers.fit.value.channel_noise()).otherwise({})
@@ -217,7 +215,6 @@ def _described(
         parameters=parameters,
         causes=lacks.causes,
         further=answers.further,
-        put_in=lacks.put_in,
         train=predictions.value.train if predictions.made else [],
         holdout=predictions.value.holdout if predictions.made else [],
         signals=signals,
@@ -243,7 +240,7 @@ def _looks(
     lacks, place, compared = answers.lacks, answers.place, answers.compared
     wider = result.parameters if answers.doubted else ()
     drifts = {} if Findings(lacks.findings).of(Code.NOISE_FREE) else result.noise
-    asked = lacks.misfit is not None and not grows(answers.fit.value.windows)
+    asked = lacks.misfit is not None and not answers.fit.value.windows.impacts
     return {
         "alarms": lambda: [
             *(look.finding for look in (*place.logs, lacks.misfit) if look is not None and look.alarm),

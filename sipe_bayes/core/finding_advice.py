@@ -113,7 +113,6 @@ ADVICE: dict[Code, str] = {
         "Nothing to do for a few. For many see whether the column itself jumps: then look at the sensor, its cable and "
         "its driver; else at what the model lacks."
     ),
-    Code.NOT_SMOOTH: f"{_COMPARE} {_SMOOTHER}",
     Code.STARTS_AT_REST: (
         "Without a pose a window of a free body starts anywhere but where the body was. Measure it, or take the "
         "likelihood that infers states."
@@ -122,32 +121,11 @@ ADVICE: dict[Code, str] = {
         "Beyond a dead centre what is measured tells two places of the mechanism. Measure the joint that goes round."
     ),
     Code.HELD_OUT_AT_REST: "Only the errors on held-out logs suffer. Measure the pose there too.",
-    Code.SCATTER: (
-        "Nothing to do: the intervals are themselves uncertain by a third to a fifth. More tosses narrow them."
-    ),
-    Code.WINDOWS_LOST: (
-        "Look at the law of contact and at the masses of what is struck, try shorter windows (`window`), or "
-        "`likelihood = 'state_space'`."
-    ),
-    Code.WINDOWS_LEFT_OUT: (
-        "Nothing to do: the intervals are those of the other windows. Shorter windows lose less to an impact."
-    ),
-    Code.SCATTER_UNKNOWN: (
-        "Record more logs with impacts, or cut them into shorter windows (`window`); take out parameters that differ "
-        "between logs."
-    ),
-    Code.SLIPS: (
-        "Use the model to predict, as far as its held-out errors are small. For values, leave out of `parameters` what "
-        "trades with others (masses of wheels, a centre of mass that was measured), and see whether the rest stays."
-    ),
-    Code.ROUGH_EVERYWHERE: (
-        "Take `npe` or `bayessim` as well. Let windows begin shortly before the contacts that matter."
-    ),
+    Code.IMPACTS: "With `state_space` every sample is a segment of its own, and process noise is estimated.",
     Code.BEYOND_START_NOISE: (
         "Raise `budget`, with another `--out`: the search then begins from more places. Shorter windows have fewer "
         "valleys. If nothing helps, the model lacks something: `sipe discover`."
     ),
-    Code.NOT_LOOKED_AROUND: "Raise `budget`: the look around the optimum comes last.",
     Code.TOO_FEW_DRAWS: f"The posterior bends more than a normal follows. {_COMPARE}",
     Code.NONLINEAR_STARTS: "Starts are marginalised by a linearisation, which fails over long windows. Halve `window`.",
     Code.NONLINEAR_STATES: "As of starts: states between contacts are linearised. Hold it against `laplace`.",
@@ -206,10 +184,6 @@ ADVICE: dict[Code, str] = {
         '`noise.model = "white"`, whose fit follows the motion itself.'
     ),
     Code.MISFIT_NOT_ASKED: "Judge by the held-out logs.",
-    Code.WINDOWS_NOT_FOLLOWED: (
-        "Through impacts that the model misses no linearisation says what other physics does; what only these would "
-        "show is not seen. Judge by the held-out logs."
-    ),
     Code.NOISE_FREE: "Nothing to do. A log from a machine has noise: add some before you judge what a log would tell.",
     Code.UNTOLD: (
         "Motion tells masses, inertias and friction only in the scale of the forces, with where they lie, and delays "

@@ -168,10 +168,6 @@ class Code(Enum):
         "{count} samples of {channels} in {logs} logs were left out of the fit: no smooth motion explains them "
         "(glitches, or what the model lacks)"
     )
-    NOT_SMOOTH = blocking(
-        "at the optimum the simulation is not what its linearisation says, by {gain:.1f} nats of a step or of a "
-        "point nearby: it is not smooth there (friction, contact or delay); compare with mcmc"
-    )
     STARTS_AT_REST = blocking(
         "the measurements do not tell the whole pose of joint {joint}: every window starts the rest of it where the "
         "model has it; measure {needed}, or use likelihood = 'state_space'"
@@ -184,35 +180,13 @@ class Code(Enum):
         "the measurements do not tell the whole pose of joint {joint}: simulations of held-out logs start the rest of "
         "it where the model has it; measure {needed} to believe their errors"
     )
-    SCATTER = note(
-        "impacts make the simulation rough, and {why}: the intervals are those of the scatter of {groups} groups of "
-        "windows fitted apart ({lost} of them lost)"
-    )
-    WINDOWS_LOST = blocking(
-        "the model does not follow the windows through impacts, or leaves more than the samples scatter by: what "
-        "misses alike is off alike, so that nothing says by how much"
-    )
-    WINDOWS_LEFT_OUT = note("{left} of {windows} windows tell nothing: the model misses impacts there, or jumps there")
-    SCATTER_UNKNOWN = blocking(
-        "impacts make the simulation rough, and {windows} windows are too few to see by their scatter how well the "
-        "parameters are known: the intervals may be far too narrow; give at least 8, without parameters per log"
-    )
-    SLIPS = blocking(
-        "what touches all along seems to slip and stick: simulations are steeper over short changes of the parameters "
-        "than over wide ones, so that neither their slopes nor the scatter of {groups} groups of windows, which may "
-        "all be off along one ridge, says how well values are known"
-    )
-    ROUGH_EVERYWHERE = blocking(
-        "the simulation is rough at every scale around the optimum (contact): the intervals hold what fits no worse "
-        "than its nearest neighbours, and the search may have missed a better place; compare with npe or bayessim"
+    IMPACTS = blocking(
+        "Bodies strike or slip within the segments of these logs, so the likelihood of segments has many optima. "
+        "Use likelihood = 'state_space'"
     )
     BEYOND_START_NOISE = blocking(
-        "simulations leave in {which} windows {times:.1f} times the noise measurements of their known starts have: "
-        "the search ended in a wrong valley, or the model lacks something; give a larger budget and more restarts"
-    )
-    NOT_LOOKED_AROUND = blocking(
-        "the budget left no room to look around the optimum: where contact is rough, the intervals may be too narrow; "
-        "give a larger budget, and the same folder goes on"
+        "The residuals are {times:.1f} times the measurement noise at the known initial states: the search ended at a "
+        "wrong optimum, or the model lacks something. Raise the budget and the restarts"
     )
     TOO_FEW_DRAWS = blocking(
         "the posterior is no normal, and {draws} draws from it came to {effective:.1f} effective ones: compare with "
@@ -275,8 +249,7 @@ class Code(Enum):
         "noise of {channels} has a correlation time as long as the logs ({tau:.2g} s): mostly changes from sample to "
         "sample were fitted, hardly where the motion goes"
     )
-    MISFIT_NOT_ASKED = note("whether the residuals are noise is not asked: the model follows too few windows, or slips")
-    WINDOWS_NOT_FOLLOWED = note("only {followed} of {windows} windows are followed, and asked what the model lacks")
+    MISFIT_NOT_ASKED = note("Whether the residuals are noise is not tested: segments meet impacts")
     NOISE_FREE = note(
         "the model explains the logs but for {share:.0e} of what they move, as where they were simulated without "
         "noise: what is left is rounding, and says nothing of the model; the intervals are those of rounding too"

@@ -46,7 +46,6 @@ _UNFINISHED = (
     Code.SEARCH_UNSETTLED,
     Code.PROCESS_NOISE_UNSETTLED,
     Code.NOT_JUDGED,
-    Code.NOT_LOOKED_AROUND,
 )
 """Those that say no more than that a search did not come to its end: what the model lacks is often the cause."""
 

@@ -81,9 +81,6 @@ class Thresholds(Options):
     small_misfit: float = option(
         0.1, "a cause that explains less of every channel's residual is small", "of the residual"
     )
-    asked: float = option(
-        0.75, "of fewer windows through impacts what the model lacks is not asked enough to say that it lacks nothing"
-    )
     much_process_noise: float = option(
         0.1, "process noise below it leaves the motion to the model", "of the movement in a control step"
     )

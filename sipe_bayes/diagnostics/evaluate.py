@@ -18,8 +18,6 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Residual, Signal
 from sipe_bayes.diagnostics.thinning import spread_windows
-from sipe_bayes.inference.laplace.options import GrowingTuning
-from sipe_bayes.inference.laplace.windows.growing_windows import grown_starts, grows, measured_starts
 from sipe_bayes.likelihood.noise import Noise, whiten
 from sipe_bayes.likelihood.restricted import marginal
 from sipe_bayes.likelihood.windows import Windows
@@ -62,7 +60,7 @@ def _roots(windows: Windows, square: FloatArray) -> FloatArray:
 
 def _squares(windows: Windows, theta: FloatArray) -> FloatArray:
     """Squared errors (B, W, L, C) of theta (B, N) from measured starts, zero where nothing was measured."""
-    return _off(windows, windows.predict(theta, measured_starts(windows, theta))[0])
+    return _off(windows, windows.predict(theta, windows.no_starts(len(theta)))[0])
 
 
 def _off(windows: Windows, predicted: FloatArray) -> FloatArray:
@@ -73,7 +71,7 @@ def _off(windows: Windows, predicted: FloatArray) -> FloatArray:
 def both_predicted(windows: Windows, theta: FloatArray) -> FloatArray:
     """Predictions (2, W, L, C) from measured starts: of theta (N,) and of the model as given."""
     thetas = np.stack([theta, np.clip(windows.simulator.space.default_theta, 0, 1)])
-    return windows.predict(thetas, measured_starts(windows, thetas))[0]
+    return windows.predict(thetas, windows.no_starts(len(thetas)))[0]
 
 
 def compare_errors(
@@ -260,10 +258,10 @@ def _band(windows: Windows, theta: FloatArray, draws: FloatArray, here: FloatArr
     spread = draws.std(0)
     if spread.max() > _NARROW or len(theta) > _FEW_DRAWS:
         few = draws[:: max(1, len(draws) // _FEW_DRAWS)]
-        return windows.predict(few, measured_starts(windows, few, theta))[0]
+        return windows.predict(few, windows.no_starts(len(few)))[0]
     step = np.where(theta + spread <= 1, 1.0, -1.0) * np.maximum(spread, windows.theta_step)
     beside = theta + np.diag(step)
-    slopes = (windows.predict(beside, measured_starts(windows, beside, theta))[0] - here) / step[:, None, None, None]
+    slopes = (windows.predict(beside, windows.no_starts(len(beside)))[0] - here) / step[:, None, None, None]
     return np.asarray(here + np.tensordot(draws - theta, slopes, axes=1))
 
 
@@ -299,7 +297,7 @@ def fitted_residuals(windows: Windows, theta: FloatArray, noise: Noise, starts: 
 
 
 def starts_cost(windows: Windows) -> int:
-    """Rollouts of ``best_starts`` at most; about, of bodies that tumble, whose windows grow."""
+    """Rollouts of ``best_starts`` at most."""
     each = windows.num_start + len(_SHORTER)
     return (1 + _ITERATIONS * each) * len(windows.trajectories)
 
@@ -321,9 +319,6 @@ def _from_best_starts(windows: Windows, theta: FloatArray, noise: Noise) -> tupl
         residual, valid = windows.residuals(theta[None], starts[None])
         return residual[0], bool(valid[0])
 
-    if grows(windows):
-        starts = grown_starts(windows, theta, noise, GrowingTuning())
-        return starts, *simulated(starts)
     starts = windows.no_starts()
     residual, valid = simulated(starts)
     for _ in range(_ITERATIONS if valid and np.isfinite(residual).all() else 0):

@@ -211,7 +211,6 @@ class Misfit:
             where that cannot be told.
         floor: the least p that the draws of the null can give.
         alike: how many causes the cause's words name, which explain about as much.
-        searchable: whether ``sipe discover`` can try them.
     """
 
     p: float
@@ -225,7 +224,6 @@ class Misfit:
     shift: dict[str, float] = field(default_factory=dict)
     floor: float = 0.0
     alike: int = 1
-    searchable: bool = True
 
     @property
     def alarm(self) -> bool:

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, field
 from sipe_bayes.core import view
 from sipe_bayes.core.findings import Code, Finding, Findings
 from sipe_bayes.core.html import Page, html_table
-from sipe_bayes.diagnostics.misfit.put_in import PutIn
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
 from sipe_bayes.diagnostics.records import (
     BandCoverage,
@@ -102,10 +101,9 @@ class Calibration:
         misfit: what the residuals look like; None where they could not be looked at.
         outside: of each training log, whether the prior gives such a one.
         noise: of each fitted channel.
-        causes: for which the parameters' ``further`` allow, to first order; none where they were put in.
+        causes: for which the parameters' ``further`` allow, to first order.
         further: theta with what the model lacks or may lack, of which the parameters' ``further`` are the intervals;
             None where nothing can be said.
-        put_in: what was put into the model, of which ``further`` then is; none where nothing was, or not all was found.
         mixing: of Markov chains; None of other methods.
         logs: what was read and what was done to it.
         run: configuration, versions, seed and checksums, as JSON has them.
@@ -133,7 +131,6 @@ class Calibration:
     noise: dict[str, ChannelNoise] = field(default_factory=dict)
     causes: tuple[str, ...] = ()
     further: Particles | None = None
-    put_in: tuple[PutIn, ...] = ()
     mixing: Mixing | None = None
     logs: list[LogReport] = field(default_factory=list)
     run: dict[str, object] = field(default_factory=dict)
@@ -203,7 +200,6 @@ class Calibration:
             "bands": None if self.bands is None else asdict(self.bands),
             "misfit": None if self.misfit is None else {**asdict(self.misfit), "matters": self.misfit.matters},
             "causes": list(self.causes),
-            "put_in": [asdict(cause) for cause in self.put_in],
             "outside_prior": [asdict(o) for o in self.outside],
             "ridges": [{"text": r.text, **asdict(r)} for r in self.ridges],
             "findings": [item.to_dict() for item in self.findings],

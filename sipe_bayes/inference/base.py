@@ -159,6 +159,7 @@ class Estimator(ABC, Generic[S]):
         check_comparison(simulator, likelihood, progress, self.name, self.searches)
         self.seed = whole("seed", seed, 0)
         self.likelihood: Segments | StateSpace = likelihood or default_likelihood(simulator)  # the latter for searches
+        self._own_likelihood = likelihood is None and self.searches
         self.checkpoint, self.progress = self.stored("checkpoint", checkpoint), progress
         self.rollouts, self.findings = 0, Findings()
         self.diagnostics: dict[str, Any] = {}
@@ -217,6 +218,7 @@ class Estimator(ABC, Generic[S]):
             CheckpointError: for a checkpoint that is damaged or of another run.
         """
         batch, ends = self._given.stack(self._recorded(trajectories), anew=True), time.monotonic() + self.time_limit
+        self.likelihood = default_likelihood(self.simulator, batch) if self._own_likelihood else self.likelihood
         self.budget = self.budget_for(batch) if self._own_budget else self.budget
         fingerprint = self._fingerprint(batch)
         self.findings, self.diagnostics, self.rollouts, self._bound = Findings(), {}, 0, None

@@ -37,11 +37,11 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.optimum import WindowOptimum
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import Optimum, distinct
-from sipe_bayes.inference.laplace.windows.state import WindowOptimum
-from sipe_bayes.inference.laplace.windows.target import Target, WindowFit, WindowTarget, value_cost
+from sipe_bayes.inference.laplace.target import Target, WindowFit, WindowTarget, value_cost
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows

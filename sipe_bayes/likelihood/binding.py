@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import overload
 
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.callable_windows import CallableWindows
 from sipe_bayes.likelihood.settings import Segments, StateSpace, check_seen
+from sipe_bayes.likelihood.starts.estimates import contacts_of
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.indirect_positions import indirect_positions
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood.windows import Windows, meets_impacts
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
+from sipe_bayes.simulation.contacts import may_touch
 from sipe_bayes.simulation.simulator import Simulator
 
 
@@ -52,9 +55,20 @@ def _chain(settings: StateSpace, simulator: Simulator | CallableSimulator, traje
     return chain
 
 
-def default_likelihood(simulator: Simulator | CallableSimulator) -> Segments:
-    """Windows of half a second; of a function white noise of the sd that it states, zero where it makes its own."""
+def default_likelihood(
+    simulator: Simulator | CallableSimulator, trajectories: Trajectories | None = None
+) -> Segments | StateSpace:
+    """Segments of half a second, or a ``StateSpace`` for logs along which bodies strike or slip, where it can be had.
+
+    Of a function white noise of the sd that it states, zero where it makes its own.
+    """
     if not isinstance(simulator, CallableSimulator):
-        return Segments()
+        environment = simulator.environment
+        if trajectories is None or environment.memory_size or not may_touch(simulator.model):
+            return Segments()
+        if (environment.remembers > trajectories.dt.min()).any():
+            return Segments()
+        logs = [replace(log, states=None) for log in trajectories]
+        return StateSpace() if meets_impacts(simulator, contacts_of(simulator, logs)) else Segments()
     sd = simulator.noise_sd or (0.0,) * len(simulator.environment.channels)
     return Segments(None, noise="white", noise_sd=sd, starts="recorded")

@@ -20,7 +20,7 @@ class CallableWindows(Windows):
     def __init__(self, settings: Segments, simulator: CallableSimulator, trajectories: Trajectories) -> None:
         self.simulator = simulator  # type: ignore[assignment]
         self.trajectories, self.settings = trajectories, settings
-        self.rollouts, self.budget, self.short, self._subset = 0, math.inf, False, None
+        self.rollouts, self.budget, self.short = 0, math.inf, False
         size = len(simulator.environment.channels)
         if trajectories.observations.shape[2] != size or trajectories.actions.shape[1:] != (1, 0):
             raise ValueError(
@@ -45,6 +45,7 @@ class CallableWindows(Windows):
         self.actions = trajectories.actions
         self.sequences = sequences(self.observed, np.tile([0, 1], (count, 1)), self.log, self.dt)
         self.reference, self.num_start, self.weak_precision = np.zeros((count, 0)), 0, np.zeros(0)
+        self.measured_precision, self.physics_steps, self.impacts = np.zeros(0), count, False
 
     @property
     def starts_measured(self) -> bool:

@@ -31,8 +31,6 @@ class Pulls:
         start_pull: (W, D), its negative gradient.
         free: (N,), parameters that may move. One held at a bound against its pull is no unknown of the linear model:
             with it the residuals would be credited with an optimum that is not allowed.
-        held: whether the residuals are credited with no optimum at all, since no simulation follows the linear model to
-            it; what is unknown takes its degrees of freedom all the same.
     """
 
     prior: FloatArray
@@ -40,7 +38,6 @@ class Pulls:
     start_precision: FloatArray
     start_pull: FloatArray
     free: BoolArray
-    held: bool = False
 
 
 def eliminate_starts(
@@ -98,7 +95,6 @@ def restricted(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, Flo
 
     Returns:
         The value; best step (N,) and covariance (N, N) of theta, zero where it may not move; the starts eliminated.
-        Held, the step is zero and the value lacks what it would gain.
     """
     normal = moments.normal(noise)
     solved = eliminate_starts(normal, moments.num_theta, pulls.start_precision, pulls.start_pull)
@@ -117,8 +113,6 @@ def restricted(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, Flo
         value += 2 * float(np.log(np.diag(factor)).sum())
         gained += float(half @ half)
         move[pulls.free], covariance[free] = inverse.T @ half, inverse.T @ inverse
-    if pulls.held:
-        return -0.5 * value, np.zeros(n), covariance, solved
     return -0.5 * (value - gained), move, covariance, solved
 
 
@@ -138,7 +132,7 @@ def restricted_slopes(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[flo
     inner = np.zeros((windows, size + 1, size + 1))
     if d:
         slope = solved.slope
-        starts = np.zeros(slope.shape[:2]) if pulls.held else solved.blocks(move)
+        starts = solved.blocks(move)
         by_start[:, n : n + d], by_start[1:, n + d :] = -slope, -slope[:-1]
         v[:, n : n + d], v[1:, n + d : size] = starts, starts[:-1]
         same, apart = solved.covariances()

@@ -17,6 +17,8 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -26,7 +28,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.rotations import nearest, written_near
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_scales, whiten
+from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_level, noise_scales, pooled, whiten
 from sipe_bayes.likelihood.sequences import Sequence, compared_samples, owned_samples, reached, sequences, spread_blocks
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments, chosen_channels, fitted_rotations
 from sipe_bayes.likelihood.starts.estimates import (
@@ -82,7 +84,6 @@ class Windows:
     ) -> None:
         self.simulator, self.trajectories, self.settings = simulator, trajectories, settings
         self.rollouts, self.budget, self.short = 0, math.inf, False
-        self._subset: Windows | None = None
         self.channels = chosen_channels(simulator, trajectories, settings.fit)
         self.rotations = fitted_rotations(simulator.environment.rotations, self.channels)
         self.scales = noise_scales(len(self.channels), self.rotations)
@@ -161,7 +162,7 @@ class Windows:
 
         Coloured noise hides in what is measured itself, not in its slopes.
         """
-        if not self.num_start or self.grows:
+        if not self.num_start or self.impacts:
             return self.weak_precision
         return self.slope_precision if self.settings.noise == "ar1" else self.measured_precision
 
@@ -172,33 +173,23 @@ class Windows:
         return bool((self.measured_precision[rates] > self.weak_precision[rates]).all())
 
     @cached_property
-    def grows(self) -> bool:
-        """Whether bodies tumble or strike something, or slip on it; with starts to estimate.
+    def impacts(self) -> bool:
+        """Whether bodies strike something or slip on it, so that simulations jump and short ones are smoother.
 
-        A body that flies and touches nothing moves as smoothly as joints do.
+        From known initial states, of which little else may be known, whether anything touches.
         """
-        if not (self.num_start and self.starts_measured):
-            return False
-        contacts = self.contacts
-        return contacts.change or contacts.rough or (contacts.touch and bool(self.simulator.environment.poses))
+        return meets_impacts(self.simulator, self.contacts, known=not self.num_start)
+
+    @cached_property
+    def physics_steps(self) -> int:
+        """Of all windows together."""
+        skip = np.array([self.simulator.physics_steps(float(dt))[0] for dt in self.dt])
+        return int((self.steps * skip).sum())
 
     @cached_property
     def contacts(self) -> Contacts:
         """What bodies touch along the logs."""
         return contacts_of(self.simulator, [self.trajectories[k] for k in np.unique(self.log).tolist()])
-
-    def every_other(self) -> Windows:
-        """Every other window, for a rough search; the windows themselves where a log has fewer than four.
-
-        Its rollouts are counted by themselves, as if whole.
-        """
-        if np.bincount(self.log).min() < 4:
-            return self
-        if self._subset is None:
-            within = np.concatenate([np.arange(n) for n in np.bincount(self.log)])
-            self._subset = self.part(np.flatnonzero(within % 2 == 0))
-        self._subset.rollouts, self._subset.budget = self.rollouts, self.budget
-        return self._subset
 
     def mask(self, samples: IntArray) -> None:
         """Leave out samples (k, 3), each by log, number in it and channel of the model, and no others.
@@ -217,14 +208,11 @@ class Windows:
             place = sample - self.start
             own = np.flatnonzero((self.log == log) & (place >= 0) & (place < length))
             self.observed[own, place[own], self.channels.index(channel)] = False
-        self._subset, self._masked = None, len(samples)
+        self._masked = len(samples)
         self._in_order()
 
     def beginnings(self, steps: int) -> Windows:
-        """The first control ``steps`` of every window, as its latest sensor sees them; itself where none is longer.
-
-        Its rollouts are counted by themselves, as if whole.
-        """
+        """The first control ``steps`` of every window, as its latest sensor sees them; itself where none is longer."""
         steps += int(max(self.lead.max(), self.begin.max(1).min()))
         if steps >= self.steps.max():
             return self
@@ -235,23 +223,40 @@ class Windows:
         return view._in_order()
 
     def part(self, keep: IntArray, observed: BoolArray | None = None) -> Windows:
-        """Some of the windows, and samples (K, L, C) of theirs. Their rollouts are counted as if all were simulated."""
+        """Some of the windows, and samples (K, L, C) of theirs."""
         view = copy.copy(self)
         for name in _BY_WINDOW:
             setattr(view, name, getattr(self, name)[keep])
         view.goals = None if self.goals is None else self.goals[keep]
         view.names = [self.names[w] for w in keep]
         view.observed = view.observed if observed is None else observed
-        view._subset, view._masked = None, 0
+        view._masked = 0
         return view._in_order()
+
+    @contextmanager
+    def counting(self, view: Windows) -> Iterator[None]:
+        """Count what a view, a share of these windows, simulates meanwhile; it may spend what is left."""
+        before, share = self.rollouts, float(view.steps.sum() / self.steps.sum())
+        view.rollouts, view.budget = before, before + (self.budget - before) / share
+        try:
+            yield
+        finally:
+            self.rollouts = before + math.ceil((view.rollouts - before) * share)
 
     def _in_order(self) -> Windows:
         """After other samples have become those that count."""
-        for name in ("spread", "rounding"):
+        for name in ("spread", "rounding", "physics_steps"):
             vars(self).pop(name, None)
         sample = self.start[:, None] + np.arange(self.observed.shape[1])
         self.sequences = sequences(self.observed, sample, self.log, self.dt)
         return self
+
+    @property
+    def level(self) -> Noise:
+        """White noise of the size that the samples' roughness shows, or as given."""
+        rough = noise_level(self.trajectories, self.settings, self.simulator)[self.channels]
+        rough = pooled(np.maximum(rough, self.rounding), self.scales)
+        return Noise(np.where(np.isnan(self.fixed_sd), rough, self.fixed_sd), np.zeros(len(rough)))
 
     @cached_property
     def spread(self) -> FloatArray:
@@ -292,9 +297,10 @@ class Windows:
         """N."""
         return len(self.simulator.space)
 
-    def no_starts(self) -> FloatArray:
-        """The starts (W, D) at their reference."""
-        return np.zeros((self.num_windows, self.num_start))
+    def no_starts(self, batch: int | None = None) -> FloatArray:
+        """The starts (W, D) at their reference, or a batch (B, W, D) of them."""
+        shape = (self.num_windows, self.num_start)
+        return np.zeros(shape if batch is None else (batch, *shape))
 
     def states(self, theta: FloatArray, starts: FloatArray) -> FloatArray:
         """Starting states (B, W, S) of starts (B, W, D) under theta (B, N)."""
@@ -446,6 +452,15 @@ class Windows:
         flat = residual.reshape(len(residual), -1, len(self.channels))
         parts = [whiten(flat[..., c], s, float(noise.sd[c]), float(noise.tau[c])) for c, s in enumerate(self.sequences)]
         return np.asarray(sum((p**2).sum(-1) for p in parts))
+
+
+def meets_impacts(simulator: Simulator, contacts: Contacts, known: bool = False) -> bool:
+    """Whether bodies strike something or slip on it along logs; a free body that touches anything may.
+
+    known: whether initial states are known, between which anything may have happened.
+    """
+    touches = known or bool(simulator.environment.poses)
+    return may_touch(simulator.model) and (contacts.change or contacts.rough or (contacts.touch and touches))
 
 
 def inward(theta: FloatArray, ways: FloatArray) -> FloatArray:

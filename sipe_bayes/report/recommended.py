@@ -2,10 +2,8 @@
 
 Where a wider interval stands beside the plain one, with what the model lacks or may lack, draws come from theta with
 that (``diagnostics.misfit.missing_physics``), correlations included, each parameter stretched to the ends that are
-printed. Where what is missing was put into the model (``diagnostics.misfit.larger_model``), theta of that model and of
-the plain one are drawn in equal parts: the model that a policy is trained in does not have it yet. Where no value of a
-parameter may be used, it is drawn from its prior, by default all of its bounds, whatever the others are: the logs
-defend nothing narrower.
+printed. Where no value of a parameter may be used, it is drawn from its prior, by default all of its bounds, whatever
+the others are: the logs defend nothing narrower.
 """
 
 from __future__ import annotations
@@ -86,8 +84,7 @@ def recommended(calibration: Calibration) -> Recommended:
     unusable = np.array([basis.usable is Usable.NONE for basis in bases.values()])
     posterior = calibration.posterior
     if calibration.further is not None:
-        spread = _with_plain if calibration.put_in else _stretched
-        posterior = spread(calibration, calibration.further)
+        posterior = _stretched(calibration, calibration.further)
     if unusable.all():
         posterior = calibration.prior
     elif unusable.any():
@@ -107,14 +104,6 @@ def _stretched(calibration: Calibration, further: Particles) -> Particles:
             low, high = (min(max(space[j].normalise(value), 0.0), 1.0) for value in parameter.further)
             theta[:, j] = np.interp(theta[:, j], [0.0, *ends[:, j], 1.0], [0.0, low, high, 1.0])
     return Particles(theta, space, weights=further.weights)
-
-
-def _with_plain(calibration: Calibration, further: Particles) -> Particles:
-    """Theta of the model that has what this one lacks, and in equal parts the plain posterior."""
-    plain = calibration.posterior.sample((len(further.theta),), generator=torch.Generator().manual_seed(0))
-    weights = further.weights / further.weights.sum()
-    equal = torch.full_like(weights, 1 / len(weights))
-    return Particles(torch.cat([further.theta, plain]), further.space, weights=torch.cat([weights, equal]))
 
 
 def _freed(posterior: Posterior, prior: Posterior, unusable: BoolArray) -> Particles:

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from sipe_bayes.core.finding_texts import TEXTS
 from sipe_bayes.core.findings import Code, Findings
 from sipe_bayes.core.thresholds import THRESHOLDS
-from sipe_bayes.diagnostics.misfit.put_in import PutIn
 from sipe_bayes.diagnostics.records import BandCoverage, ChannelScore, Comparison
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
-from sipe_bayes.report.words import listed, number, significant, unit_text
+from sipe_bayes.report.words import listed, number, significant
 
 _ONE = "The one value may be trusted within its interval"
 _UNTOLD = "if the numbers that no log tells are right"
@@ -203,7 +202,7 @@ def headline(
     good = [p for p in wanted if _of_the_logs(p, findings).tone == "good"]
     if not good:
         return Verdict("bad", "No value may be trusted within its interval; the table says why.")
-    unasked = bool(findings.of(Code.MISFIT_NOT_ASKED, Code.CHECKS_SKIPPED, Code.WINDOWS_NOT_FOLLOWED))
+    unasked = bool(findings.of(Code.MISFIT_NOT_ASKED, Code.CHECKS_SKIPPED))
     hanging = [p.name for p in good if _hangs(p, findings)]
     conditions = ["if the model lacks nothing"] if unasked else []
     if hanging:
@@ -272,20 +271,14 @@ def lack(calibration: Calibration) -> Verdict | None:
     """What the model lacks, where that matters; the warnings say more."""
     misfit = calibration.misfit
     if misfit is None and any(f.code is Code.MISFIT_NOT_ASKED for f in calibration.findings):
-        few = "it follows too few windows, or slips; values may lie beyond their intervals"
-        return Verdict("fair", f"Whether the model lacks something was not asked: {few}.")
+        return Verdict("fair", "Whether the model lacks something was not asked: segments meet impacts.")
     if misfit is None or not misfit.alarm:
         return None
-    if put := [_put(cause) for cause in calibration.put_in]:
-        text = (
-            f"The model lacks something. With {_few(put)} put in, it leaves nothing but noise: the first intervals are"
-        )
-        return Verdict("fair", f"{text} of that model.")
     share = f"{number(100 * misfit.share[misfit.channel], 2)} % of the residual of {misfit.channel}"
     if not misfit.matters:
         return Verdict("fair", f"The model lacks something small: it looks like {misfit.cause} ({share}).")
     text = f"The model lacks something: it looks like {misfit.cause} ({share}, {misfit.p_text})."
-    text += " `sipe discover` tries it." if misfit.shift and misfit.searchable else ""
+    text += " `sipe discover` tries it." if misfit.shift else ""
     if misfit.alike > 1:  # with which of them values would move is open
         return Verdict("bad", text)
     moved = sorted(misfit.moved, key=lambda name: -abs(misfit.shift[name]))[:_DOUBTS]
@@ -298,12 +291,6 @@ def lack(calibration: Calibration) -> Verdict | None:
         values = [_would_be(calibration, name, misfit.shift[name]) for name in moved]
         text += f" With it, to first order, {listed(values)}."
     return Verdict("bad", text)
-
-
-def _put(cause: PutIn) -> str:
-    """What was put in, with its size."""
-    size = f"{significant(cause.value, cause.sd)} ± {number(cause.sd, 1)} {unit_text(cause.unit)}".rstrip()
-    return f"{cause.cause} ({size})"
 
 
 def _led_out(calibration: Calibration, name: str, sds: float) -> bool:
@@ -356,8 +343,8 @@ def verdicts(calibration: Calibration, brief: bool = False) -> list[Verdict]:
 
 
 def between_logs(calibration: Calibration) -> Verdict | None:
-    """What the intervals with what the model lacks, or may lack, hold, where there are any; not of another model."""
-    if all(p.further is None for p in calibration.parameters) or calibration.put_in:
+    """What the intervals with what the model lacks, or may lack, hold, where there are any."""
+    if all(p.further is None for p in calibration.parameters):
         return None
     if not _lacks(Findings(calibration.findings)):
         return _allowed_for(calibration)

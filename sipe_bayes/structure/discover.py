@@ -14,7 +14,6 @@ from sipe_bayes.core.checkpoint import load_state, save_state
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import MOST_ROLLOUTS, cores, nearest_name, whole
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.inference.recorded import Progress, digest
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
@@ -196,7 +195,7 @@ def _search(
         whole("seed", seed, 0),
         simulator.num_threads or cores(),
     )
-    if grows(fitting.windows(simulator)):
+    if fitting.windows(simulator).impacts:
         raise ValueError(
             "logs: contacts come and go along them, and through impacts two structures' fits differ by which of these "
             "they meet, more than by what they hold; add what `sipe calibrate` names as parameters, fit again, and "

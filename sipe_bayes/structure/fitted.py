@@ -16,9 +16,9 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.importance import ImportanceTuning
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.options import LaplaceTuning, SolverTuning, WindowTuning
+from sipe_bayes.inference.laplace.optimum import WindowOptimum
+from sipe_bayes.inference.laplace.options import LaplaceTuning, SolverTuning
 from sipe_bayes.inference.laplace.strategy import distinct
-from sipe_bayes.inference.laplace.windows.state import WindowOptimum
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
@@ -34,7 +34,6 @@ from sipe_bayes.structure.physics_step import step_change
 from sipe_bayes.structure.scores import scores
 
 # structures differ by nats, and where friction has kinks the last ones come in ever smaller steps
-_COARSE = WindowTuning(tolerance=0.1, rough_tolerance=1e-3, most_steps=30)
 _STEPS = 40  # of a fit, which takes twenty to thirty
 _EDGE = 1e-3  # of the cube: at a bound
 _FLAT_SD = 1e3  # of the cube: stands for a uniform prior beside a normal one
@@ -232,7 +231,7 @@ class Fitting:
         """The best optimum of some logs."""
         given = None if initial is None else initial[None]
         one_noise = SolverTuning(compares=False)  # evidences of different noise do not compare
-        tuning = LaplaceTuning(windows=_COARSE, solver=one_noise, importance=ImportanceTuning(wanted=False))
+        tuning = LaplaceTuning(solver=one_noise, importance=ImportanceTuning(wanted=False))
         laplace = Laplace(
             simulator,
             prior=prior,

@@ -14,7 +14,6 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.laplace.windows.growing_windows import measured_starts
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
@@ -114,7 +113,7 @@ class Problem:
         windows = self.windows(case.trajectories)
         theta = np.atleast_2d(self.space.normalise(values))
         if self.likelihood.starts == "estimated":
-            starts = measured_starts(windows, theta)
+            starts = windows.no_starts(len(theta))
         else:
             starts = np.tile(windows.no_starts(), (len(theta), 1, 1))
         predicted, valid = windows.predict(theta, starts)

@@ -21,7 +21,6 @@ from sipe_bayes.diagnostics.records import ChannelNoise, LogReport
 from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.inference.recorded import Tell
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
@@ -91,7 +90,7 @@ class Fit:
             return _At(noise, best_starts(windows, theta, noise) if starts is None else starts)
 
         at = checks.of(Check.STARTS, _At, made)
-        linear = not (chain or grows(windows) or len(windows.trajectories) < 2)
+        linear = not (chain or windows.impacts or len(windows.trajectories) < 2)
         plain = bool(method.diagnostics.get("least_squares"))
         return cls(windows, theta, at.noise, at.starts, linear, plain)
 
@@ -134,7 +133,7 @@ def one_by_one(problem: Problem, fit: Fit, seed: int, checks: Checks) -> LogEsti
     """
 
     def made(tell: Tell, kept: Kept) -> LogEstimates:
-        if grows(fit.windows):
+        if fit.windows.impacts:
             return LogEstimates()
         if fit.lin is not None and fit.lin.valid:
             part, starts = fit.windows.part(fit.some), fit.starts[fit.some]

@@ -18,8 +18,6 @@ from sipe_bayes.diagnostics.misfit.probed_logs import steps_of
 from sipe_bayes.diagnostics.prior_predictive import PREDICTIVE
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.windows.followed import followed_cost
-from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.inference.recorded import Progress, Tell
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import StateSpace
@@ -116,16 +114,18 @@ def plan_of(problem: Problem, method: Estimator) -> Plan:
         """Of the windows that a check looks at, so many control steps at most."""
         return min(1.0, most / steps)
 
-    search, chosen = starts_cost(windows), grows(windows) and not known  # which windows are followed
+    search = starts_cost(windows)
     try:
-        lacking = 0 if chain else round(probes_cost(windows, theta) * share(steps_of(windows, theta)))
+        lacking = (
+            0 if chain or windows.impacts else round(probes_cost(windows, theta) * share(steps_of(windows, theta)))
+        )
     except ValueError:  # the model as given diverges, which the check will say
         lacking = 0
     alone = min(30 * (n + windows.num_start + 2) + 600, LOG_BUDGET) * logs
     return {
         Check.STARTS: 0 if known else 2 * search,
-        Check.LOGS: (alone if chain else round(lin * share(LOOKED_AT))) if logs > 1 and not grows(windows) else 0,
-        Check.LACKING: lacking if chain else lacking + (followed_cost(windows) if chosen else logs),
+        Check.LOGS: (alone if chain else round(lin * share(LOOKED_AT))) if logs > 1 and not windows.impacts else 0,
+        Check.LACKING: lacking if chain else lacking + logs,
         Check.PREDICTIONS: 2 * (logs + held),
         Check.COMPARISON: round(search * share(LOOKED_AT) * (logs + held)) // logs,
         Check.PRIOR: round(PREDICTIVE.simulations * logs * share(PREDICTIVE.steps)),

@@ -52,6 +52,7 @@ from sipe_bayes.envs.internal.resting import resting_joints
 from sipe_bayes.envs.poses import has_pose, is_round
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.starts.estimates import contacts_of, estimate_states
+from sipe_bayes.likelihood.windows import meets_impacts
 
 _PASSED = 300  # states of each log, of which it is looked what they touch
 _LOOKED_AT = 3  # logs that are simulated
@@ -65,7 +66,6 @@ _TURNING = 24  # windows of the fit of what turns freely: contacts take their ti
 _ROUNDS = 20  # of the fit of unknowns: with dry friction and a delay 12 end far from the optimum, at another delay
 _SPARE = 3  # columns that are not used, of which names are told
 _SHORT = 2.0  # s: logs as short are one window each
-_FEW_TOSSES = 8  # through impacts so many windows and a log held out are asked for
 
 
 def propose(
@@ -381,14 +381,15 @@ def _some(unknowns: list[Unknown]) -> tuple[list[Unknown], list[str]]:
     return [replace(unknown, left_out="") for unknown in unknowns], [doubt]
 
 
-def _window(machine: Machine, logs: Sequence[Trajectory], trial: Trial) -> tuple[float | str, str]:
-    """Length of the windows of the fit, a part of the time in which the motion goes to and fro: joints couple soon.
+def _window(machine: Machine, logs: Sequence[Trajectory], trial: Trial) -> tuple[float | str | None, str]:
+    """Length of the segments of the fit, a part of the time in which the motion goes to and fro: joints couple soon.
 
-    At most a fifth of a log, so that its held-out quarter is longer.
+    At most a fifth of a log, so that its held-out quarter is longer. None where bodies strike: ``state_space``.
     """
+    if meets_impacts(trial.simulator, contacts_of(trial.simulator, logs)):
+        return None, "bodies strike or slip along the logs"
     durations = [len(log) * log.dt for log in logs]
-    few = len(logs) <= _FEW_TOSSES and contacts_of(trial.simulator, logs).change
-    if max(durations) <= _SHORT and not few:
+    if max(durations) <= _SHORT:
         return "log", "each log as one: they are short"
     swing = trial.length * logs[0].dt / share_of(machine)
     part = _COUPLED if len(machine.joints) > 1 and share_of(machine) < _COUPLED else _SINGLE

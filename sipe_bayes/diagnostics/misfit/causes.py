@@ -9,9 +9,6 @@ Deviations:
 - A column is taken only where it raises the log evidence by ``gain``, and ``causes`` at most: there are dozens, and a
   dozen of them together would explain anything.
 - The noise is estimated anew with the columns that were taken, in turns.
-- Through impacts the causes that are taken move theta by normal shares of what they do to first order, with an sd of
-  ``unsure``: there corrections were in the right direction, and half as far as it takes. And they are taken beside
-  noise of the samples' scatter, as what the residuals look like is named (``misfit.misspecification``).
 - Gains that differ between logs are not taken: they would explain why logs differ, which the spread is to hold.
 """
 
@@ -25,7 +22,6 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs, oddness, remembering
-from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
 from sipe_bayes.posterior import Particles
@@ -39,7 +35,6 @@ class CauseOptions(Options):
     causes: int = option(4, "columns that are taken at most: a dozen small ones together explain anything", least=1)
     rounds: int = option(3, "in which causes and noise are estimated in turn", least=1)
     most: int = option(300, "steps of the search for causes", least=1)
-    unsure: float = option(1.0, "sd of how far causes move theta through impacts, of that to first order", least=0)
 
 
 CAUSES = CauseOptions()
@@ -70,9 +65,8 @@ class Causes:
     def of(cls, logs: ProbedLogs, options: CauseOptions = CAUSES) -> Causes:
         """In turns with the noise."""
         windows, n = logs.windows, logs.windows.num_theta
-        pull, impacts = -windows.start_precision * logs.starts, grows(windows)
-        beside = logs.at_scatter if impacts else logs
-        noise, memory = beside.noise, beside.memory
+        pull = -windows.start_precision * logs.starts
+        noise, memory = logs.noise, logs.memory
         span = float(windows.dt.min()), windows.trajectories.longest
         usable = np.array([not probe.by_log for probe in logs.probes], bool)
         prior, prior_pull = FLAT_PRECISION * np.eye(logs.count), np.zeros(logs.count)
@@ -97,7 +91,6 @@ class Causes:
                 logs.moments(columns), noise, pulls, windows.fixed_sd, logs.coloured, *span, windows.scales
             )
             noise = Noise(np.maximum(noise.sd, windows.rounding), noise.tau)
-            noise = logs.beside_scatter(noise) if impacts else noise
             step = covariance @ gradient[columns]
             whole = np.zeros(logs.count)
             whole[columns] = step
@@ -129,9 +122,6 @@ class Causes:
         sizes = np.tile(self.sizes(logs), (len(theta), 1))
         sizes[:, self.kept] += away
         theta = theta + away @ self.response.T + logs.traded(sizes)
-        if grows(logs.windows):  # slopes between impacts tell the direction better than how far it goes
-            far = CAUSES.unsure * random.standard_normal((len(theta), 1))
-            theta = theta + far * (self.response @ self.sizes(logs)[self.kept])
         return Particles(np.clip(theta, 0, 1), further.space, weights=further.weights.numpy())
 
 

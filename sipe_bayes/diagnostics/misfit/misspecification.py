@@ -26,9 +26,6 @@ Deviations:
 - The log's own noise is the one that the fit found, which for other methods than ``laplace`` need not be what the null
   estimates.
 - Probes are of a user's MJCF; of other environments only whiteness is asked, which slow misfit passes as slow noise.
-- Of windows through impacts samples and windows that lie far off were left out (``laplace.windows.followed``), of the
-  draws of the null none are: p is too large there by as little as noise alone lies so far. Whether noise is larger for
-  a while is not asked there: what is left of an impact is, also where the model is right.
 - Where dry friction holds the simulated joint still, a small step of what acts on it changes nothing, and says nothing.
 - Where the fit takes far more for noise than samples scatter by, that noise holds what the model lacks. It is asked
   whether the residuals are noise beside it, but what they look like beside noise of that scatter: the probe that
@@ -48,7 +45,6 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.misfit.probed_logs import MISFIT, ProbedLogs, Solved, lags, oddness
 from sipe_bayes.diagnostics.records import Misfit
-from sipe_bayes.inference.laplace.windows.growing_windows import grows
 from sipe_bayes.structure.probes import Probe
 
 
@@ -122,9 +118,8 @@ class _Named:
         causes = _alike(logs, probe)
         cause, remedy = " or ".join(c.name for c in causes), " or ".join(c.remedy for c in causes)
         moves = dict(zip(names, shift.tolist(), strict=True))
-        searchable = not grows(logs.windows)
-        named = self._placed(p, cause, remedy + "; or run sipe discover" * searchable, gains, share, moves)
-        return replace(named, alike=len(causes), searchable=searchable)
+        named = self._placed(p, cause, remedy + "; or run sipe discover", gains, share, moves)
+        return replace(named, alike=len(causes))
 
     def _colour_named(self, p: float, statistic: int, seen: Solved) -> Misfit:
         """statistic: of 2 C, autocorrelations first."""

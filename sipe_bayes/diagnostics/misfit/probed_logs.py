@@ -28,7 +28,6 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.diagnostics.misfit.whitened_rows import Products, WhitenedRows
 from sipe_bayes.diagnostics.thinning import spread_windows
-from sipe_bayes.inference.laplace.windows.growing_windows import level
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood.block_tridiagonal import Eliminated
 from sipe_bayes.likelihood.moments import Moments
@@ -130,7 +129,6 @@ class ProbedLogs:
         tell: called with what is being done.
         kept: keeps what extensions do, and draws of the null.
         extensions: that are probed; default all that the registry has.
-        steady: whether it is asked if noise is larger for a while.
 
     Raises:
         ValueError: where the simulation diverges at theta.
@@ -147,7 +145,6 @@ class ProbedLogs:
         tell: Tell = silent,
         kept: Kept = NOTHING_KEPT,
         extensions: Sequence[Extension] | None = None,
-        steady: bool = True,
     ) -> None:
         some = spread_windows(windows, steps_of(windows, theta))
         if len(some) < windows.num_windows:
@@ -155,7 +152,7 @@ class ProbedLogs:
             lin = None if lin is None else Linearisation(lin.residual[some], lin.jacobian[some], lin.valid)
         starts = best_starts(windows, theta, noise) if starts is None else starts
         prior = QuadraticPrior(theta, np.zeros((len(theta), len(theta)))) if prior is None else prior
-        self.windows, self.theta, self.noise, self.steady = windows, theta, noise, steady
+        self.windows, self.theta, self.noise = windows, theta, noise
         self.starts, self.tells = starts, noise.sd >= MISFIT.rounding * windows.rounding
         linearisation = lin or windows.linearise(theta, starts)
         if not linearisation.valid:
@@ -205,17 +202,12 @@ class ProbedLogs:
 
         That holds what a wrong model leaves, and hides what it is: slow noise passes for slow forces.
         """
-        noise = self.beside_scatter(self.noise)
-        return self if noise is self.noise else self._with(noise)
-
-    def beside_scatter(self, noise: Noise) -> Noise:
-        """A noise, white and of the samples' scatter in channels where it is far more; itself where none is."""
-        scatter = level(self.windows).sd
+        noise, scatter = self.noise, self.windows.level.sd
         rests = scatter < MISFIT.rounding * self.windows.rounding
         holds = (scatter * MISFIT.hides < noise.sd) & ~rests
         if not holds.any():
-            return noise
-        return Noise(np.where(holds, scatter, noise.sd), np.where(holds, 0.0, noise.tau))
+            return self
+        return self._with(Noise(np.where(holds, scatter, noise.sd), np.where(holds, 0.0, noise.tau)))
 
     def _with(self, noise: Noise) -> ProbedLogs:
         """The same logs beside another noise."""
@@ -314,12 +306,11 @@ class ProbedLogs:
     def whiteness(self, residual: FloatArray, noise: Noise) -> FloatArray:
         """Cube roots (2 C,) of what a residual (W, L, C) has of autocorrelation, and of its largest mean squares.
 
-        These are none where they are not asked, and both of a channel whose noise is but the simulation's rounding, as
-        of a joint that rests: that follows itself.
+        Both are none of a channel whose noise is but the simulation's rounding, as of a joint that rests: that follows
+        itself.
         """
         white = [z * told for z, told in zip(self.white(residual, noise), self.tells, strict=True)]
-        parts = MISFIT.pieces if self.steady else 0
-        split = [np.array_split(z, parts) if parts else [] for z in white]
+        split = [np.array_split(z, MISFIT.pieces) for z in white]
         pieces = [max((float((p**2).mean()) for p in own if len(p)), default=0.0) for own in split]
         return np.cbrt(np.array([autocorrelation(z) for z in white] + pieces))
 

@@ -17,6 +17,9 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import importance
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.importance import Draws, Judgement
+from sipe_bayes.inference.laplace.draws import draw_size, more, probed, sharing
+from sipe_bayes.inference.laplace.longer_windows import led_on
+from sipe_bayes.inference.laplace.optimum import WindowOptimum, WindowState, not_followed
 from sipe_bayes.inference.laplace.options import LaplaceOptions
 from sipe_bayes.inference.laplace.solver import SegmentSolver, SolverState
 from sipe_bayes.inference.laplace.state_space.chain_draws import blur, draws_size, looked_beyond
@@ -28,10 +31,6 @@ from sipe_bayes.inference.laplace.state_space.several_linearisations import line
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, contradiction
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
-from sipe_bayes.inference.laplace.windows.draws import draw_size, more, probed, sharing
-from sipe_bayes.inference.laplace.windows.longer_windows import led_on, search_of
-from sipe_bayes.inference.laplace.windows.optimum import not_followed
-from sipe_bayes.inference.laplace.windows.state import Followed, WindowOptimum, WindowState
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, StateSpace
 from sipe_bayes.likelihood.state_space.chain import Chain
@@ -96,7 +95,6 @@ class Laplace(Estimator[LaplaceState]):
         each = _STEPS * (len(self.space) + self.num_start + _TRIALS)
         if isinstance(self.likelihood, StateSpace):
             each += draws_size(len(self.space), self.problem) + linearisations_cost(self.problem, self._coordinates)
-            each += self.options.tuning.state_space.shooting.all_room if self.num_start else 0
         return max(self.default_budget, each * len(trajectories))
 
     @property
@@ -139,7 +137,7 @@ class Laplace(Estimator[LaplaceState]):
             if state.search.done:
                 assert isinstance(strategy, StateSpaceSearch)
                 assert isinstance(state.search, StateSpaceState)
-                search = strategy.shoot(state.search)
+                search = strategy.lead(state.search)
             else:
                 search = strategy.step(state.search)
         except BudgetExhausted:
@@ -164,7 +162,7 @@ class Laplace(Estimator[LaplaceState]):
             return state
         if len(state.judgements) == len(distinct(search.optima)):
             assert isinstance(windows, Chain)
-            return state if self._shots_left(search) else self._looked_beyond(windows, state, None)
+            return state if self._may_lead(windows, search) else self._looked_beyond(windows, state, None)
         return self._probed(windows, state)
 
     def _judges_share(self, windows: Windows | Chain, state: LaplaceState) -> int:
@@ -181,7 +179,7 @@ class Laplace(Estimator[LaplaceState]):
     def _strategy(self, windows: Windows | Chain) -> Strategy[Any]:
         """The search that fits the likelihood."""
         if not isinstance(windows, Chain):
-            return search_of(self.problem, windows)
+            return SegmentSolver(self.problem, windows)
         known = windows.settings.starts == "recorded"
         return KnownStartSearch(self.problem, windows) if known else StateSpaceSearch(self.problem, windows)
 
@@ -189,12 +187,12 @@ class Laplace(Estimator[LaplaceState]):
         """The state of a finished search; not done where the posterior is no normal and draws are to take its place."""
         ended = replace(state, done=True)
         if isinstance(windows, Chain):
-            optima, shots_left = distinct(state.search.optima), self._shots_left(state.search)
+            optima, may_lead = distinct(state.search.optima), self._may_lead(windows, state.search)
             if self._lost(windows, optima[0], state.search):
                 return state
             state, target = self._judged(windows, state, optima)
             stands = not state.judgements or state.judgements[0].normal
-            return self._looked_beyond(windows, state, target) if stands or not shots_left else state
+            return self._looked_beyond(windows, state, target) if stands or not may_lead else state
         assert isinstance(state.search, WindowState)
         if not (search := led_on(self.problem, windows, state.search)).done:
             return replace(state, search=search)
@@ -205,24 +203,20 @@ class Laplace(Estimator[LaplaceState]):
             return replace(ended, search=search)  # narrow, and as the linearisation foretold at its own width
         probe = probed(self.problem, windows, kept)
         if probe.stands:
-            return replace(ended, search=search.looked_around(kept[0]))
+            return replace(ended, search=search)
         state = replace(ended, search=search, draws=probe.draws, given=probe.given, unjudged=not probe.judged)
         return replace(state, done=probe.draws is None or not windows.has_room(draw_size(self.problem, windows, kept)))
 
-    def _shots_left(self, search: WindowState | StateSpaceState | KnownStartState) -> bool:
-        """Whether a finished search may go on from where windows of the logs lead."""
-        return isinstance(search, StateSpaceState) and search.shots < self.options.tuning.state_space.shooting.shots
+    def _may_lead(self, chain: Chain, search: WindowState | StateSpaceState | KnownStartState) -> bool:
+        """Whether a finished search may go on from where segments lead: once, where not every state is measured."""
+        return isinstance(search, StateSpaceState) and not search.led and not chain.determined.all()
 
     def _lost(self, chain: Chain, optimum: Optimum, search: WindowState | StateSpaceState | KnownStartState) -> bool:
-        """Whether process noise explains much of a log, and windows are to find a trajectory that needs less.
-
-        Through contact; or, once, where not every state is told.
-        """
+        """Whether process noise explains much of a log of which not every state is told: segments may need less."""
         if not isinstance(search, StateSpaceState) or not isinstance(optimum, ChainOptimum):
             return False
-        tuning = self.options.tuning.state_space.shooting
-        shots = tuning.shots if optimum.rough else int(not chain.determined.all())
-        return search.shots < shots and optimum.absorbed > tuning.absorbed * chain.observed.sum()
+        led_astray = optimum.absorbed > self.options.tuning.state_space.absorbed * chain.observed.sum()
+        return self._may_lead(chain, search) and led_astray
 
     def _judged(
         self, chain: Chain, state: LaplaceState, kept: list[Optimum]
@@ -277,7 +271,7 @@ class Laplace(Estimator[LaplaceState]):
         kept = distinct(state.search.optima)
         draws, elsewhere = more(self.problem, windows, kept, draws)
         if elsewhere:
-            search = search_of(self.problem, windows).onward(state.search, draws.points[draws.values.argmax()])
+            search = SegmentSolver(self.problem, windows).onward(state.search, draws.points[draws.values.argmax()])
             if search is not None:
                 return replace(state, search=search, draws=None)
         done = importance.ended(draws, self.prior, self.options.tuning.importance, state.given)
@@ -301,13 +295,13 @@ class Laplace(Estimator[LaplaceState]):
         weight = importance.weights(draws, self.prior)
         effective = importance.effective(weight)
         enough = effective >= tuning.least
-        if enough and isinstance(kept[0], WindowOptimum) and kept[0].unsmooth:
-            kept = [replace(kept[0], finding=None)]  # draws ask for no slope
         self._report(kept, state, enough)
         windows = self.bound(trajectories)
         if isinstance(windows, Windows) and isinstance(self.simulator, Simulator):
             assert isinstance(kept[0], WindowOptimum)
-            loose = not_followed(windows, kept[0].judged_sd)
+            if windows.impacts and windows.num_start:
+                self.find(Code.IMPACTS)
+            loose = not_followed(windows, kept[0].sd)
             if loose is not None:
                 self.find(Code.NOISE_EXCEEDS_SCATTER, channel=loose[0], ratio=loose[1])
         if state.draws is not None:
@@ -378,15 +372,9 @@ class Laplace(Estimator[LaplaceState]):
     def usual_rest(self) -> float | None:
         """Rollouts that the fit still takes as a rule; None where nothing is known of that."""
         state, bound = self.state, self._bound
-        if state is None or bound is None or not isinstance(state.search, WindowState):
+        if state is None or bound is None or not isinstance(state.search, SolverState):
             return None
-        if isinstance(state.search, SolverState):
-            return SegmentSolver(self.problem, self.windows(bound[0])).usual_rest(state.search)
-        # through impacts: 30 steps from each starting point, and 300 draws of two rollouts, at least a third of either
-        drawn = 0 if state.draws is None else len(state.draws.values)
-        later = len(state.search.points) - state.search.point - 1 + max(1 - state.search.here.iteration / 30, 0.3)
-        steps = 0.0 if drawn else later * 30 * (len(self.space) + self.num_start + 2)
-        return (steps + 2 * max(300 - drawn, 90)) * len(bound[0])
+        return SegmentSolver(self.problem, self.windows(bound[0])).usual_rest(state.search)
 
     @property
     def wild(self) -> IntArray:
@@ -400,11 +388,6 @@ class Laplace(Estimator[LaplaceState]):
         if not isinstance(best, WindowOptimum):
             return None
         return np.asarray(best.starts - best.slope @ (theta - best.theta))
-
-    @property
-    def followed(self) -> Followed | None:
-        """Windows of ``fit`` that are followed through impacts; None where that was not asked, or they are few."""
-        return self._best.followed if isinstance(self._best, WindowOptimum) else None
 
     @property
     def _best(self) -> Optimum | None:

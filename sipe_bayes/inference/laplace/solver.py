@@ -34,6 +34,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass, field, replace
 from enum import StrEnum, auto
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -41,11 +42,16 @@ from scipy.stats import chi2
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.findings import Code, finding
+from sipe_bayes.inference.laplace.energy import (
+    WindowEnergy,
+    beyond_start_noise,
+    misfit,
+    present_noise,
+    same_noise,
+    updated_noise,
+)
+from sipe_bayes.inference.laplace.optimum import WindowOptimum, WindowState, summarised
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.inference.laplace.windows.energy import WindowEnergy, misfit, present_noise, same_noise, updated_noise
-from sipe_bayes.inference.laplace.windows.growing_windows import counted, grows, lent, level
-from sipe_bayes.inference.laplace.windows.optimum import Ending, summarised
-from sipe_bayes.inference.laplace.windows.state import WindowOptimum, WindowState
 from sipe_bayes.likelihood.minimise import damped_box_step
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
@@ -58,6 +64,10 @@ from sipe_bayes.likelihood.windows import Linearisation, Windows, inward
 
 _DAMPINGS = np.array([0.03, 1.0, 30.0, 1000.0])  # tried together, times the damping of the step before
 _DIFFERENCE = 0.3  # conditional posterior sds that a finite difference is long
+_THROUGH_IMPACTS = 100  # draws from the prior, of which the best are followed where simulations jump
+_SCOUTED_STEPS = 16  # after which the next of them is followed: most fits that settle do so by then
+_ROUNDS = 2  # of further draws, where no fit settles at the noise of the known states
+_SCOUTS = 4  # of them that are followed on the shortest beginnings
 _WORSE = 1.03  # free-run error over the plain fit's from which white noise takes over
 
 
@@ -116,16 +126,22 @@ class SolverState(WindowState):
         freed: whether the mode's free-run error has been compared with the plain fit's.
         wider: by how much coloured residuals make the variance of plain least squares larger than white ones would.
         scouted: whether further starting points were tried.
+        ends: energies where plain fits of the shortest beginnings ended, of each starting point through impacts.
+        reached: theta (N,) there.
+        rounds: of further draws from the prior that were followed.
         behind: how many times the plain fit's that error was; 0 where it was not larger.
     """
 
-    here: Here  # type: ignore[assignment]
+    here: Here
     plain: FloatArray = field(default_factory=lambda: np.zeros(0))
     compared: bool = False
     freed: bool = False
     scouted: bool = False
     wider: float = 1.0
     behind: float = 0.0
+    ends: tuple[float, ...] = ()
+    reached: tuple[FloatArray, ...] = ()
+    rounds: int = 0
 
     @property
     def behind_noise(self) -> bool:
@@ -175,12 +191,18 @@ class SegmentSolver:
 
     def start(self) -> SolverState:
         """The first state: at the model as given, or at the starting point that the options name."""
-        initial = self.problem.options.initial
-        points = np.clip(self.problem.space.default_theta, 0, 1)[None] if initial is None else initial[:1]
-        theta, valid = self._screened(points, 0 if initial is not None else self.problem.options.candidates)
+        options, nominal = self.problem.options, np.clip(self.problem.space.default_theta, 0, 1)
+        if options.initial is not None:
+            points, valid = options.initial[:1], True
+        elif self._beginnings and options.restarts > 1:
+            points, valid = self._screened(nominal, _THROUGH_IMPACTS)
+        else:
+            points, valid = self._screened(nominal, 0)
+            if not valid:
+                points = self._screened(nominal, options.candidates)[0][:1]
         if not valid:
             self.problem.find(finding(Code.DIVERGES_AS_GIVEN))
-        return SolverState(theta[None], 0, self._begin(theta))
+        return SolverState(points, 0, self._begin(points[0]))
 
     def onward(self, state: WindowState, theta: FloatArray, starts: FloatArray | None = None) -> SolverState | None:
         """A fit that had ended, from a better place (N,) and initial states (W, D); None where it has had enough."""
@@ -224,28 +246,35 @@ class SegmentSolver:
 
     # Parts of the segments
 
+    @cached_property
+    def _beginnings(self) -> list[int]:
+        """Control steps of the segments' beginnings that are fitted before the whole: ever more through impacts."""
+        longest = int(self.windows.steps.max())
+        return growing_steps(longest, self.tuning.growth) if self.windows.impacts else []
+
     def _share(self, part: int) -> float:
         """Of the segments that a part holds."""
         windows = self.windows
-        skip = np.array([windows.simulator.physics_steps(float(dt))[0] for dt in windows.dt])
         columns = windows.num_theta + windows.num_start + 1
-        most = self.tuning.linearised_steps / columns * (0.25, 1.0, self.tuning.whole)[part]
-        return float(most / (windows.steps * skip).sum())
+        sizes = (*(0.25 for _ in self._beginnings), 0.25, 1.0, self.tuning.whole)
+        return float(self.tuning.linearised_steps / columns * sizes[part] / windows.physics_steps)
 
     def _view(self, part: int) -> tuple[IntArray, Windows]:
-        """Numbers (K,) of the segments of a part, and these."""
+        """Numbers (K,) of the segments of a part, and these or their beginnings."""
         if part not in self._views:
             share, windows = self._share(part), self.windows
-            if share >= 1:
-                self._views[part] = np.arange(windows.num_windows), windows
-            else:
+            keep = np.arange(windows.num_windows)
+            if share < 1:
                 keep = spread_segments(windows.log, share)
-                self._views[part] = keep, windows.part(keep)
+                windows = windows.part(keep)
+            if part < len(self._beginnings):
+                windows = windows.beginnings(self._beginnings[part])
+            self._views[part] = keep, windows
         return self._views[part]
 
     def _last(self, stage: Stage) -> int:
         """The largest part that a stage simulates."""
-        return 1 if stage is Stage.PLAIN else 2
+        return len(self._beginnings) + (1 if stage is Stage.PLAIN else 2)
 
     def _as_measured(self, view: Windows) -> Windows:
         """Segments whose initial states are known as well as smoothed measurements tell them."""
@@ -255,38 +284,34 @@ class SegmentSolver:
 
     def _next_part(self, stage: Stage, part: int) -> int | None:
         """The next part with more segments; None where there is none."""
-        size = len(self._view(part)[0])
+        size = self._view(part)[1].observed.size
         for other in range(part + 1, self._last(stage) + 1):
-            if len(self._view(other)[0]) > size:
+            if self._view(other)[1].observed.size > size:
                 return other
         return None
 
     # Steps
 
-    def _screened(self, points: FloatArray, draws: int) -> tuple[FloatArray, bool]:
-        """The first point if its simulation is valid, else the best of draws from the prior; and whether it was."""
-        view = self._view(0)[1]
-        before = lent(self.windows, view)
-        try:
-            valid = bool(view.residuals(points, np.tile(view.no_starts(), (1, 1, 1)))[1][0])
-            if valid or not draws:
-                return points[0], valid
-            generator = torch.Generator().manual_seed(self.problem.seed)
-            drawn = self.problem.prior.sample((draws,), generator=generator).numpy()
-            return self._best(view, drawn), False
-        finally:
-            counted(self.windows, view, before)
+    def _screened(self, nominal: FloatArray, draws: int, number: int = 0) -> tuple[FloatArray, bool]:
+        """The nominal model (N,) and the best draws from the prior, best first; and whether the former is valid.
 
-    def _best(self, view: Windows, thetas: FloatArray) -> FloatArray:
-        """That of thetas (B, N) whose plain residuals are least."""
-        residual, valid = view.residuals(thetas, np.tile(view.no_starts(), (len(thetas), 1, 1)))
+        By plain residuals of the smallest part; each ``number`` has draws of its own.
+        """
+        view = self._view(0)[1]
+        generator = torch.Generator().manual_seed(self.problem.seed + number)
+        drawn = self.problem.prior.sample((draws,), generator=generator).numpy()
+        thetas = np.concatenate([nominal[None], drawn])
+        with self.windows.counting(view):
+            residual, valid = view.residuals(thetas, view.no_starts(len(thetas)))
         loss = np.array([self._profile(view, r) if ok else np.inf for r, ok in zip(residual, valid, strict=True)])
-        if not np.isfinite(loss).any():
+        if draws and not valid.any():
             raise ValueError(
-                f"every one of {len(thetas)} starting points diverges in the simulation; narrow the bounds, "
+                f"every one of {draws} starting points diverges in the simulation; narrow the bounds, "
                 "shorten the model's timestep or the window"
             )
-        return np.asarray(thetas[int(loss.argmin())])
+        order = np.argsort(loss, kind="stable")
+        best = [0] * bool(valid[0]) + [int(k) for k in order if k and np.isfinite(loss[k])]
+        return thetas[best[:_SCOUTS]] if draws else thetas, bool(valid[0])
 
     def _profile(self, view: Windows, residual: FloatArray) -> float:
         """Energy of a residual (K, L, C) with white noise of its own size."""
@@ -336,8 +361,8 @@ class SegmentSolver:
 
     def _plain(self, state: SolverState) -> SolverState:
         here, (keep, view) = state.here, self._view(state.here.part)
-        n, starts, before = view.num_theta, view.no_starts(), lent(self.windows, view)
-        try:
+        n, starts = view.num_theta, view.no_starts()
+        with self.windows.counting(view):
             scale = self._lengths(view, here)
             axes = self._usable(here)
             lin = view.linearise(here.theta, starts, True, False, here.residual, scale[:n], axes=axes)
@@ -348,9 +373,7 @@ class SegmentSolver:
             hessian = precision + self.prior.precision + FLAT_PRECISION * np.eye(n)
             energy = self._profile(view, lin.residual) + self.prior.energy(here.theta)
             thetas = np.stack([self._moved(hessian, pull, here.theta, d) for d in self._dampings(here)])
-            residuals, valid = view.residuals(thetas, np.tile(starts, (len(thetas), 1, 1)))
-        finally:
-            counted(self.windows, view, before)
+            residuals, valid = view.residuals(thetas, view.no_starts(len(thetas)))
         energies = np.array(
             [
                 self._profile(view, r) + self.prior.energy(theta) if ok else np.inf
@@ -370,10 +393,26 @@ class SegmentSolver:
         stuck = gained <= 0 and here.damping >= 1.0
         if (gained > enough or (gained <= 0 and not stuck)) and after.iteration < self.tuning.most_steps:
             return replace(state, here=after)
+        if here.part == 0 and self._beginnings and len(state.ends) < len(state.points):
+            state, after = self._scouted(state, after, energy - max(gained, 0.0))
+            if after.part == 0:
+                return replace(state, here=after)
         part = self._next_part(Stage.PLAIN, here.part)
         if part is not None and after.iteration < self.tuning.most_steps:
             return replace(state, here=replace(after, part=part, residual=None))
         return self._plain_ended(replace(state, here=here), after, lin, keep, view)
+
+    def _scouted(self, state: SolverState, here: Here, energy: float) -> tuple[SolverState, Here]:
+        """After a plain fit of the smallest part: from the next starting point, or on from the best end of all."""
+        state = replace(state, ends=(*state.ends, energy), reached=(*state.reached, here.theta))
+        if (point := len(state.ends)) < len(state.points):
+            return replace(state, point=point), self._begin(state.points[point])
+        return self._from_end(state, int(np.argmin(state.ends)))
+
+    def _from_end(self, state: SolverState, number: int) -> tuple[SolverState, Here]:
+        """On longer beginnings, from where one of the plain fits of the shortest ended; it is not followed again."""
+        ends = tuple(np.inf if k == number else end for k, end in enumerate(state.ends))
+        return replace(state, point=number, ends=ends), replace(self._begin(state.reached[number]), part=1)
 
     def _plain_ended(
         self, state: SolverState, here: Here, lin: Linearisation, keep: IntArray, view: Windows
@@ -409,8 +448,7 @@ class SegmentSolver:
     def _fit(self, state: SolverState) -> SolverState:
         here, (keep, view) = state.here, self._view(state.here.part)
         view = self._as_measured(view) if here.white else view
-        before = lent(self.windows, view)
-        try:
+        with self.windows.counting(view):
             lin, fresh, scale = self._linearised(view, here, here.starts[keep])
             if not lin.valid:  # on more segments than before: from the initial states that were measured
                 here = replace(here, starts=self.windows.no_starts(), residual=None)
@@ -424,13 +462,9 @@ class SegmentSolver:
             noise = here.noise
             if here.iteration == 0 or (here.stage is Stage.FIT and not here.noise.tau.any()):
                 noise = present_noise(view, lin.residual)
-            noise = updated_noise(
-                view, moments, noise, here.theta, here.starts[keep], self.prior, not here.white, held=False
-            )
+            noise = updated_noise(view, moments, noise, here.theta, here.starts[keep], self.prior, not here.white)
             tolerance = self.tuning.tolerance * max(view.num_theta, 1) * state.wider
             trial, lengths = self._tried(view, here, lin, moments, noise, here.starts[keep], tolerance)
-        finally:
-            counted(self.windows, view, before)
         after = replace(
             here,
             iteration=here.iteration + 1,
@@ -443,7 +477,8 @@ class SegmentSolver:
         small = trial.expected < tolerance or (trial.gained < tolerance and here.damping <= 1.0)
         settled = small and same_noise(noise, here.noise)
         stuck = trial.gained <= 0 and here.damping >= 1e3
-        last = after.iteration >= self.tuning.most_steps or self._leaves_no_room()
+        elsewhere = bool(np.isfinite(state.ends).any()) and after.iteration >= _SCOUTED_STEPS
+        last = elsewhere or after.iteration >= self.tuning.most_steps or self._leaves_no_room()
         near = settled and here.exact
         if (settled or stuck) and not (fresh or near or last):
             return replace(state, here=replace(after, starts_jacobian=None))
@@ -476,7 +511,7 @@ class SegmentSolver:
         n, pull = view.num_theta, -view.start_precision * starts
         prior = self.prior.precision + FLAT_PRECISION * np.eye(n)
         coloured = view.moments(lin)
-        noise = updated_noise(view, coloured, white, here.theta, starts, self.prior, coloured=True, held=False)
+        noise = updated_noise(view, coloured, white, here.theta, starts, self.prior, coloured=True)
         steps: list[FloatArray] = []
         spread: FloatArray = np.eye(n)
         plain: FloatArray = np.eye(n)
@@ -568,30 +603,15 @@ class SegmentSolver:
         if settled and here.white and self.windows.settings.noise != "white":
             view = view.part(np.arange(view.num_windows))
             view.settings, moments = replace(view.settings, noise="sandwich"), view.moments(lin)
-        begin, starts = state.points[state.point], here.starts[keep]
-        ending = Ending(
-            here.theta,
-            starts,
-            here.noise,
-            moments,
-            lin.residual,
-            lin.jacobian,
-            begin,
-            here.iteration,
-            here.misfit,
-            refused=0.0,
-            tells=False,
-            settled=settled,
-            cut_short=not settled,
-            bettered=None,
-        )
-        optimum = summarised(self.problem, view, ending)
+        optimum = summarised(self.problem, view, here.theta, here.starts[keep], here.noise, moments, lin)
         slope = np.zeros((self.windows.num_windows, self.windows.num_start, view.num_theta))
         slope[keep] = optimum.slope
         reason = None
         if not settled:
             steps, whole = here.iteration, here.iteration >= self.tuning.most_steps
             reason = finding(Code.SEARCH_UNSETTLED, steps=steps) if whole else finding(Code.SEARCH_CUT_SHORT)
+        elif (times := beyond_start_noise(self.windows, optimum.sd)) is not None:
+            reason = finding(Code.BEYOND_START_NOISE, times=times)
         return replace(optimum, starts=here.starts, slope=slope, finding=reason)
 
     def _ended(
@@ -608,6 +628,15 @@ class SegmentSolver:
         optimum = self._optimum(state, here, lin, moments, keep, view, settled)
         state = self._recorded(state, optimum)
         state = replace(state, here=replace(here, residual=None, starts_jacobian=None))
+        if state.ends and optimum.finding is None:
+            return replace(state, done=True)
+        if np.isfinite(state.ends).any():
+            state, here = self._from_end(state, int(np.argmin(state.ends)))
+            return replace(state, here=here)
+        if state.ends and state.rounds < _ROUNDS:
+            points = self._screened(optimum.theta, _THROUGH_IMPACTS, state.rounds + 1)[0]
+            again = replace(state, points=points, point=0, ends=(), reached=(), rounds=state.rounds + 1)
+            return replace(again, here=self._begin(points[0]))
         if self._is_poor(optimum) and not state.scouted and self.problem.options.restarts > 1:
             return self._further(state)
         if state.point + 1 < len(state.points):
@@ -627,7 +656,7 @@ class SegmentSolver:
         """Whether residuals are far larger than what samples scatter by, and a good part of what channels do."""
         windows = self.windows
         large = optimum.sd > 0.1 * windows.spread
-        return bool((large & (optimum.sd > self.tuning.poor * level(windows).sd)).any())
+        return bool((large & (optimum.sd > self.tuning.poor * windows.level.sd)).any())
 
     def _further(self, state: SolverState) -> SolverState:
         """Further starting points: the best of draws from the prior that are not near the optimum."""
@@ -635,13 +664,11 @@ class SegmentSolver:
         options = self.problem.options
         generator = torch.Generator().manual_seed(self.problem.seed + 1)
         drawn = self.problem.prior.sample((max(options.candidates, 1),), generator=generator).numpy()
-        before = lent(self.windows, view)
         try:
-            residual, valid = view.residuals(drawn, np.tile(view.no_starts(), (len(drawn), 1, 1)))
+            with self.windows.counting(view):
+                residual, valid = view.residuals(drawn, view.no_starts(len(drawn)))
         except BudgetExhausted:
             return replace(state, scouted=True, done=True)
-        finally:
-            counted(self.windows, view, before)
         loss = np.array([self._profile(view, r) if ok else np.inf for r, ok in zip(residual, valid, strict=True)])
         away = np.linalg.norm(drawn - state.optima[-1].theta, axis=1)
         loss = np.where(away >= np.median(away), loss, np.inf)  # near ones end at the same optimum
@@ -672,7 +699,7 @@ class SegmentSolver:
         windows = self.windows
         settings = replace(windows.settings, window=None, windows=(), noise="white", seconds=None)
         for view in (Windows(settings, windows.simulator, windows.trajectories), windows):
-            view, starts = copy.copy(view), np.tile(view.no_starts(), (2, 1, 1))
+            view, starts = copy.copy(view), view.no_starts(2)
             view.start_precision = view.measured_precision  # else an initial state hides what parameters should explain
             for _ in range(2):
                 windows.spend(2)
@@ -717,6 +744,10 @@ def spread_segments(log: IntArray, share: float) -> IntArray:
     return np.concatenate(kept)
 
 
-def fits_segments(windows: Windows) -> bool:
-    """Whether the segments are fitted by this solver: their initial states are estimated, no impact interrupts them."""
-    return windows.num_start > 0 and not grows(windows)
+def growing_steps(longest: int, growth: float) -> list[int]:
+    """Control steps of beginnings that grow by a factor, from two on and below ``longest``."""
+    steps, size = [], 2.0
+    while round(size) < longest:
+        steps.append(round(size))
+        size = max(size * growth, size + 1)
+    return steps

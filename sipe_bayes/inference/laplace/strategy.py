@@ -1,6 +1,6 @@
 """What ``laplace`` asks of a search for optima, and what it gives it.
 
-A ``Strategy`` is a class for one kind of likelihood: ``WindowSearch`` (windows of the logs), ``StateSpaceSearch``
+A ``Strategy`` is a class for one kind of likelihood: ``SegmentSolver`` (segments of the logs), ``StateSpaceSearch``
 (every sample's state is unknown) and ``KnownStartSearch`` (the first states are known). It is made of a
 ``SearchProblem`` and of the logs bound to their likelihood, writes ``start`` and ``step`` over its own frozen state,
 and hands over ``Optimum``s.
@@ -202,13 +202,3 @@ def mixture(optima: Sequence[Optimum], space: ParameterSpace) -> GaussianMixture
     weights = torch.from_numpy(evidence - evidence.max())
     means, covariances = np.stack([o.centre for o in optima]), np.stack([o.spread for o in optima])
     return GaussianMixture(weights, means, covariances, space)
-
-
-def merged(optima: Sequence[Optimum]) -> Optimum:
-    """The best of the optima, best first, with mean and covariance of all, weighted by their evidence."""
-    best = optima[0]
-    weight = np.exp([one.evidence - best.evidence for one in optima])
-    weight /= weight.sum()
-    mean = np.sum([w * one.mean for w, one in zip(weight, optima, strict=True)], axis=0)
-    spread = [one.covariance + np.outer(one.mean - mean, one.mean - mean) for one in optima]
-    return replace(best, mean=mean, covariance=np.tensordot(weight, np.stack(spread), 1))

@@ -84,48 +84,6 @@ class WideTuning(Options):
 
 
 @dataclass(frozen=True)
-class HorizonTuning(Options):
-    """How beginnings of the logs grow; see ``growing_horizon``."""
-
-    first: int = option(8, "control steps of the first beginning at least: smooth in theta", least=1)
-    growth: float = option(1.45, "how much longer the next one is", above=1)
-    slower_growth: float = option(1.2, "the same at the second attempt", above=1)
-    fits: float = option(3.0, "residuals below which there is no second attempt", "noise sds", above=0)
-    budget_share: float = option(0.4, "of the budget in all: the rest is the search's", above=0, below=1)
-    most_rollouts: int = option(600, "rollouts of one beginning of each log", least=1)
-    guess_share: float = option(0.3, "of them for guesses, at most", above=0, most=1)
-    draws: int = option(60, "guesses for a beginning", least=0)
-    followed: int = option(2, "how many of them are followed", least=1)
-
-
-@dataclass(frozen=True)
-class ShootingTuning(Options):
-    """When windows grow beside the smoother's search, and how; see ``shooting``."""
-
-    shots: int = option(2, "how often it is tried, the budget allowing", least=0)
-    window: int = option(8, "control steps of the first windows: hardly more than one impact", least=2)
-    first: int = option(4, "control steps of their first beginnings", least=2)
-    follows: float = option(1.25, "growth of the residual up to which longer windows count as following", least=1)
-    room: int = option(800, "rollouts of a log for each try in the default budget", least=0)
-    lost: float = option(1.5, "residual from which a window's start is sought by draws", "noise sds", above=1)
-    rounds: int = option(3, "of seeking such starts and of descending, on windows of one length", least=1)
-    draw_rounds: int = option(25, "of draws, each about the best until then: few windows are lost", least=0)
-    most_drawn: int = option(150, "rollouts of them, after which no round begins", least=0)
-    draws: int = option(40, "of a round: thirty found the right side of a pushed box's contact", least=1)
-    decades: tuple[float, float] = option((-2.0, 0.3), "their widths, over the noise of a start", "powers of ten")
-    steps: int = option(20, "wide ones for which it leaves room in the budget: few searches take more", least=1)
-    process: float = option(0.01, "process noise of the smoother that goes on from there", "of the movement", above=0)
-    absorbed: float = option(
-        0.1, "share of the samples that process noise explains, through contact, with which it is tried", above=0
-    )
-
-    @property
-    def all_room(self) -> int:
-        """Rollouts of a log that the default budget leaves to all of them."""
-        return self.shots * self.room
-
-
-@dataclass(frozen=True)
 class ChainTuning(Options):
     """Numbers of the searches over a chain of states."""
 
@@ -135,5 +93,5 @@ class ChainTuning(Options):
     outliers: OutlierTuning = option(OutlierTuning(), "which jumps become outliers")
     smoothing: SmoothingTuning = option(SmoothingTuning(), "the search from measured states")
     wide: WideTuning = option(WideTuning(), "steps by differences as long as the posterior is wide")
-    horizon: HorizonTuning = option(HorizonTuning(), "how its starting points are found")
-    shooting: ShootingTuning = option(ShootingTuning(), "how a trajectory through contacts is found otherwise")
+    horizon: float = option(0.4, "of the budget, for starting points from known first states", above=0, below=1)
+    absorbed: float = option(0.1, "share of the samples that process noise explains, from which segments lead", above=0)

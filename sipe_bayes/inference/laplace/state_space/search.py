@@ -12,8 +12,8 @@
 5. WIDEN: where differences as long as the posterior is wide (``posterior_linearisation``) say something else of it than
    short ones did, or the noise did not settle with these, the search goes on with them; what that ends in takes the
    optimum's place. Then the next starting point.
-6. Where draws find that the best optimum is not the posterior's (``inference.importance.judged``), windows of the logs
-   that grow (``shooting``) lead to further starting points.
+6. Where not every state is measured, and process noise explains much of the logs, or draws find that the best optimum
+   is not the posterior's (``inference.importance.judged``), segments of the logs lead to a further starting point.
 
 Of each starting point the likeliest optimum is kept: its normal in theta, with the states integrated out, is what
 ``laplace`` makes its truncated normal of. Where the logs' first states are known another search is made
@@ -29,6 +29,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.inference.laplace.longer_windows import trailed
 from sipe_bayes.inference.laplace.state_space.kalman_filter import filtered
 from sipe_bayes.inference.laplace.state_space.noise import (
     NoisePosterior,
@@ -40,7 +41,6 @@ from sipe_bayes.inference.laplace.state_space.noise import (
 )
 from sipe_bayes.inference.laplace.state_space.outlying_jumps import needed, outstanding
 from sipe_bayes.inference.laplace.state_space.posterior_linearisation import WidePosition, WideSearch
-from sipe_bayes.inference.laplace.state_space.shooting import shot
 from sipe_bayes.inference.laplace.state_space.smoother import ChainPoint, smooth, solvable
 from sipe_bayes.inference.laplace.state_space.state import (
     ChainState,
@@ -50,7 +50,6 @@ from sipe_bayes.inference.laplace.state_space.state import (
     screened,
     unknown_noise,
 )
-from sipe_bayes.inference.laplace.windows.longer_windows import trailed
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
 from sipe_bayes.likelihood.state_space.differences import linearise
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states
@@ -75,12 +74,12 @@ class StateSpaceState(ChainState[SmoothingPosition]):
 
     Args:
         regressed: thetas (R, N) at which regressions have ended.
-        shots: how often windows have led to a further starting point, or failed to.
+        led: whether segments have led to a further starting point, or failed to.
     """
 
     here: SmoothingPosition
     regressed: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    shots: int = 0
+    led: bool = False
 
 
 @dataclass(frozen=True)
@@ -132,24 +131,17 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         here = SmoothingPosition(phase, theta, chain.reference, unknown_noise(chain), ones, damping, refused=none)
         return replace(here, theta_step=np.zeros(chain.num_theta), state_step=np.zeros(chain.prior_precision.shape))
 
-    def shoot(self, state: StateSpaceState) -> StateSpaceState:
-        """A finished search, once more from where windows of the logs end; as it was where they lead nowhere.
-
-        Through contact they begin at the best optimum's states and theta; else where the log's windows do.
-        """
-        chain, tuning = self.chain, self.tuning.shooting
-        best = max(state.optima, key=lambda one: one.evidence)
-        states = [chain.reference, *(one.states for one in state.optima)]
-        state = replace(state, shots=state.shots + 1)
+    def lead(self, state: StateSpaceState) -> StateSpaceState:
+        """A finished search, once more from where segments of the logs end; as it was where they lead nowhere."""
+        chain, state = self.chain, replace(state, led=True)
         judges = 2 * self.problem.options.tuning.importance.judges  # of two optima
-        room = tuning.steps * self.wide_step_rollouts + judges * len(chain.trajectories)
-        budget = chain.budget - chain.rollouts - room
-        end = shot(self.problem, chain, best.theta, states, budget) if best.rough else self._by_windows(budget)
+        room = 20 * self.wide_step_rollouts + judges * len(chain.trajectories)  # few searches take more steps
+        end = self._by_windows(chain.budget - chain.rollouts - room)
         if end is None:
             return replace(state, uncounted=chain.uncounted)
         movement, fixed = chain.movement(end.states), chain.fixed_sd
         sd = np.where(np.isnan(fixed), np.maximum(roughness(chain), chain.least[0]), fixed)
-        noise = ChainNoise(sd, np.maximum(tuning.process * movement, chain.least[1]))
+        noise = ChainNoise(sd, np.maximum(0.01 * movement, chain.least[1]))
         here = replace(self._begin(end.theta), states=end.states, movement=movement, phase=Phase.WIDEN)
         here = replace(here, noise=self._guessed(noise, movement), estimate_theta=end.theta)
         points = np.concatenate([state.points, end.theta[None]])

@@ -20,7 +20,7 @@ import torch
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
-from sipe_bayes.inference.laplace.windows.target import FOLLOWED, FORETOLD, Target
+from sipe_bayes.inference.laplace.target import FOLLOWED, FORETOLD, Target
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.differences import compare, linearise_by
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, eliminate_states, log_likelihood, pull

@@ -20,10 +20,9 @@ import numpy as np
 
 from sipe_bayes.inference import importance
 from sipe_bayes.inference.importance import Draws
-from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, merged, mixture
-from sipe_bayes.inference.laplace.windows.pattern_search import SHORTEST
-from sipe_bayes.inference.laplace.windows.state import WindowOptimum
-from sipe_bayes.inference.laplace.windows.target import WindowFit, WindowTarget, value_cost
+from sipe_bayes.inference.laplace.optimum import WindowOptimum
+from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, mixture
+from sipe_bayes.inference.laplace.target import WindowFit, WindowTarget, value_cost
 from sipe_bayes.inference.stretches import Stretch, look_size, proposals, stretches
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.windows import Windows
@@ -49,12 +48,7 @@ class Probe:
 
 
 def sharing(kept: Sequence[Optimum], problem: SearchProblem) -> list[Optimum]:
-    """The optima, best first, that have a share of the mass; as one where slopes are noise, which makes several of one.
-
-    kept: the distinct ones, best first.
-    """
-    if len(kept) > 1 and isinstance(kept[0], WindowOptimum) and kept[0].unsmooth:
-        return [merged(kept)]
+    """The optima, best first, that have a share of the mass; kept: the distinct ones, best first."""
     least = kept[0].evidence + np.log(problem.options.tuning.stretches.unseen)
     return [one for one in kept if one.evidence >= least]
 
@@ -79,16 +73,12 @@ def probed(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) ->
     best, tuning, n = kept[0], problem.options.tuning.importance, len(problem.space)
     if not tuning.wanted:
         return Probe()
-    if not isinstance(best, WindowOptimum) or best.guessed or best.scatters or best.trims:
-        return Probe()
-    if windows.settings.noise == "sandwich":
+    if windows.settings.noise == "sandwich" or windows.impacts:
         return Probe()
     shared = sharing(kept, problem)
     if len(shared) > 1 and windows.num_start:
         return Probe()
     sds = np.sqrt([np.diag(one.covariance) for one in shared])
-    if sds.min() < 10 * SHORTEST:
-        return Probe()  # an sd that the look around the optimum may have set
     probes = len(shared) * importance.probe_size(n) if not windows.num_start or sds.max() > _OPEN else 0
     look = value_cost(windows) * look_size(n, near=False) if len(shared) == 1 else 0
     if not windows.has_room(windows.num_start + probes + look):
@@ -96,9 +86,9 @@ def probed(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) ->
     target = target_at(problem, windows, best)
     if target.silent:
         return Probe()
-    stands = not best.unsmooth and (len(shared) > 1 or not best.heavier)  # heavier: for another optimum, perhaps
-    if stands and probes:
-        stands = all(importance.is_normal(target, one.theta, one.mean, one.covariance, tuning) for one in shared)
+    stands = not probes or all(
+        importance.is_normal(target, one.theta, one.mean, one.covariance, tuning) for one in shared
+    )
     beyond: list[Stretch] = []
     if len(shared) == 1:
         try:

@@ -24,8 +24,8 @@ import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.inference.laplace.windows.energy import beyond_rounding, estimated, free_noise
-from sipe_bayes.inference.laplace.windows.state import WindowOptimum
+from sipe_bayes.inference.laplace.energy import beyond_rounding, estimated, free_noise
+from sipe_bayes.inference.laplace.optimum import WindowOptimum
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.restricted import Pulls, marginal

@@ -18,11 +18,9 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.laplace.solver import SegmentSolver, fits_segments
+from sipe_bayes.inference.laplace.optimum import WindowOptimum, WindowState
+from sipe_bayes.inference.laplace.solver import SegmentSolver
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.inference.laplace.windows.growing_windows import level
-from sipe_bayes.inference.laplace.windows.search import WindowSearch
-from sipe_bayes.inference.laplace.windows.state import WindowOptimum, WindowState
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
 from sipe_bayes.likelihood.windows import Windows
@@ -43,11 +41,6 @@ class Trail:
     states: Sequence[FloatArray]
 
 
-def search_of(problem: SearchProblem, windows: Windows) -> SegmentSolver | WindowSearch:
-    """What fits the windows."""
-    return SegmentSolver(problem, windows) if fits_segments(windows) else WindowSearch(problem, windows)
-
-
 def led_on(problem: SearchProblem, windows: Windows, state: WindowState) -> WindowState:
     """A finished search on from where longer windows lead; as it is where it is not lost, or they are no better."""
     tuning, settings = problem.options.tuning.longer, windows.settings
@@ -55,7 +48,7 @@ def led_on(problem: SearchProblem, windows: Windows, state: WindowState) -> Wind
     if not asked or not windows.num_start or windows.starts_measured:
         return state
     best = max(state.optima, key=lambda one: one.evidence)
-    if not (best.sd > tuning.lost * level(windows).sd).any():
+    if not (best.sd > tuning.lost * windows.level.sd).any():
         return state
     tried, before = replace(state, longer=True), windows.rollouts
     budget = min(tuning.share * (windows.budget - before), tuning.most * before)
@@ -72,7 +65,7 @@ def led_on(problem: SearchProblem, windows: Windows, state: WindowState) -> Wind
     if not valid[0] or not np.log(left / best.sd).mean() < np.log(tuning.better):
         return tried
     fresh = replace(tried, optima=(), wild=np.zeros((0, 3), np.int64))
-    return search_of(problem, windows).onward(fresh, trail.theta, starts) or tried
+    return SegmentSolver(problem, windows).onward(fresh, trail.theta, starts) or tried
 
 
 def trailed(
@@ -88,7 +81,7 @@ def trailed(
     logs = Trajectories.stack([replace(one, states=None) for one in trajectories])
     windows = bind(lengthened, simulator, logs)
     windows.budget = budget
-    search, optima = search_of(replace(problem, find=lambda _: None), windows), tuple[WindowOptimum, ...]()
+    search, optima = SegmentSolver(replace(problem, find=lambda _: None), windows), tuple[WindowOptimum, ...]()
     try:
         state = search.start()
         while not state.done:

@@ -8,15 +8,12 @@ present residuals, or maximises the restricted likelihood.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.stats import chi2
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.thresholds import THRESHOLDS
-from sipe_bayes.inference.laplace.levenberg_marquardt import Descent, QuadraticModel
-from sipe_bayes.inference.laplace.options import WindowTuning
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, pooled
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior, free_to_move
@@ -25,15 +22,6 @@ from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 
 _SAME_NOISE = 0.03  # relative: a change of an sd that moves no optimum
-
-
-@dataclass(frozen=True)
-class WindowPoint:
-    """theta (N,), starts (W, D), and the residual (W, L, C) of the simulation there."""
-
-    theta: FloatArray
-    starts: FloatArray
-    residual: FloatArray
 
 
 @dataclass(frozen=True)
@@ -54,42 +42,14 @@ class WindowEnergy:
         return np.array([self(theta, starts, residual) for theta, residual in zip(thetas, residuals, strict=True)])
 
 
-class LinearisedWindows:
-    """A ``LinearisedEnergy`` of windows; ``moments`` are of the linearisation at the point, or at an earlier one."""
-
-    def __init__(self, of: WindowEnergy, point: WindowPoint, moments: Moments) -> None:
-        self.of, self.point, self.moments = of, point, moments
-        self.theta, self.energy = point.theta, of(point.theta, point.starts, point.residual)
-
-    @cached_property
-    def _normal(self) -> FloatArray:
-        return self.moments.normal(self.of.noise)
-
-    def model(self, damping: float) -> QuadraticModel:
-        """The quadratic model in theta, the starts eliminated."""
-        precision, prior = self.of.windows.start_precision, self.of.prior
-        pull = -precision * self.point.starts
-        solved = eliminate_starts(self._normal, self.moments.num_theta, precision, pull, damping)
-        hessian, gradient = solved.precision + prior.precision, solved.gradient + prior.pull(self.theta)
-        return QuadraticModel(hessian, gradient, solved.explained, solved.blocks)
-
-    def simulated(self, theta: FloatArray, change: FloatArray) -> tuple[WindowPoint, float]:
-        """The point at theta (N,) with the starts changed by (W, D), and its energy."""
-        starts = self.point.starts + change
-        residual, valid = self.of.windows.residuals(theta[None], starts[None])
-        point = WindowPoint(theta, starts, residual[0])
-        return point, self.of(theta, starts, residual[0]) if valid[0] else np.inf
-
-
 def pulls(
     windows: Windows,
     prior: QuadraticPrior,
     theta: FloatArray,
     starts: FloatArray,
     force: FloatArray,
-    held: bool = False,
 ) -> Pulls:
-    """Priors and bounds at theta (N,) and starts (W, D); held as ``Pulls`` has it.
+    """Priors and bounds at theta (N,) and starts (W, D).
 
     force (N,): that of the data on theta, which may press it against a bound.
     """
@@ -97,7 +57,7 @@ def pulls(
     flat = FLAT_PRECISION * np.eye(len(theta))
     start_pull = -windows.start_precision * starts
     free = free_to_move(theta, force + pull)
-    return Pulls(prior.precision + flat, pull, windows.start_precision, start_pull, free, held)
+    return Pulls(prior.precision + flat, pull, windows.start_precision, start_pull, free)
 
 
 def present_noise(windows: Windows, residual: FloatArray) -> Noise:
@@ -105,14 +65,6 @@ def present_noise(windows: Windows, residual: FloatArray) -> Noise:
     fixed, counts = windows.fixed_sd, windows.observed.sum(axis=(0, 1))
     size = pooled(np.sqrt((residual**2).sum(axis=(0, 1)) / np.maximum(counts, 1)), windows.scales)
     return Noise(np.where(np.isnan(fixed), np.maximum(size, windows.rounding), fixed), np.zeros(len(size)))
-
-
-def noise_at_least(windows: Windows, noise: Noise, residuals: FloatArray) -> Noise:
-    """The noise with sds no less than the root-mean-squares of residuals (B, W, L, C), the given ones kept."""
-    if not len(residuals):
-        return noise
-    size = np.max([present_noise(windows, r).sd ** 2 for r in residuals], axis=0) ** 0.5
-    return Noise(np.where(np.isnan(windows.fixed_sd), np.maximum(noise.sd, size), noise.sd), noise.tau)
 
 
 def updated_noise(
@@ -123,16 +75,14 @@ def updated_noise(
     starts: FloatArray,
     prior: QuadraticPrior,
     coloured: bool,
-    held: bool,
 ) -> Noise:
     """Noise that maximises the restricted likelihood of one linearisation, at theta (N,) and starts (W, D).
 
-    The search for it begins at ``before``; coloured: whether correlation times are estimated; held: whether the
-    linearisation promises what no simulation keeps.
+    The search for it begins at ``before``; coloured: whether correlation times are estimated.
     """
     start_pull = -windows.start_precision * starts
     solved = eliminate_starts(moments.normal(before), moments.num_theta, windows.start_precision, start_pull)
-    context = pulls(windows, prior, theta, starts, solved.gradient, held)
+    context = pulls(windows, prior, theta, starts, solved.gradient)
     noise = estimated(windows, moments, before, context, coloured)
     sd = np.where(np.isnan(windows.fixed_sd), np.maximum(noise.sd, windows.rounding), noise.sd)
     return Noise(sd, noise.tau)
@@ -170,11 +120,6 @@ def misfit(windows: Windows, residual: FloatArray) -> float:
     return float(np.sqrt(((residual / size)[windows.observed] ** 2).mean())) or 1e-300
 
 
-def foretold(fit: Descent[WindowPoint], tuning: WindowTuning) -> bool:
-    """Whether a step gained what the linearisation foretold."""
-    return abs(fit.gained - fit.expected) < tuning.foretold * max(fit.expected, tuning.tolerance)
-
-
 def start_noise(windows: Windows) -> FloatArray:
     """Noise (W, C) of the measurements of known starts; NaN where a channel measures no coordinate of the state."""
     out = np.full((windows.num_windows, len(windows.channels)), np.nan)
@@ -193,35 +138,6 @@ def judging_channels(windows: Windows) -> BoolArray:
     known = np.isfinite(noise) & np.isnan(windows.fixed_sd)
     size = np.sqrt(np.where(known, noise**2, 0.0).sum(0) / np.maximum(known.sum(0), 1))
     return np.asarray(known & (size > 1e-3 * np.maximum(windows.spread, 1e-300)))
-
-
-def unevenly_left(windows: Windows, residual: FloatArray) -> float | None:
-    """How many times the middle window's size a residual (W, L, C) has in the worst window; None where by chance.
-
-    Of windows from known starts, in channels whose noise these tell: one that misses an impact is left with more. The
-    worst window's mean square over the middle one's is held against chi-square over its degrees, of which tails and
-    memory leave fewer: by one half of the excess kurtosis within windows (G. E. P. Box, S. L. Andersen 1955,
-    "Permutation Theory in the Derivation of Robust Criteria", J. R. Stat. Soc. B 17) and by the correlation of
-    neighbouring samples.
-    """
-    channels = judging_channels(windows).any(axis=0)
-    sd = np.maximum(present_noise(windows, residual).sd, 1e-300)
-    seen = windows.observed & channels
-    scaled = np.where(seen, residual / sd, 0.0)
-    counts = seen.sum(axis=(1, 2))
-    squares = (scaled**2).sum(axis=(1, 2)) / np.maximum(counts, 1)
-    some = (counts > 1) & (squares > 0)
-    if some.sum() < 2:
-        return None
-    own = scaled[some] / np.sqrt(squares[some])[:, None, None]
-    excess = max(float((own**4).sum() / counts[some].sum()) - 3.0, 0.0)
-    both = seen[some, 1:] & seen[some, :-1]
-    memory = float((own[:, 1:] * own[:, :-1] * both).sum()) / max(int(both.sum()), 1)
-    memory = min(memory**2, 0.99)
-    fewer = (1 + 0.5 * excess) * (1 + memory) / (1 - memory)
-    ratios, degrees = squares[some] / np.median(squares[some]), counts[some] / fewer
-    chance = chi2.sf(ratios * degrees, degrees).min() * some.sum()
-    return None if chance > THRESHOLDS.start_noise else float(np.sqrt(ratios.max()))
 
 
 def beyond_start_noise(windows: Windows, sd: FloatArray) -> float | None:
