@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
+from sipe_bayes.diagnostics.misfit.put_in import PutIn
 
 from sipe_bayes.calibration.checks.lacking import Lacking, _Missing, _WithCauses
 from sipe_bayes.calibration.gathered import Marginals, no_rigid_bodies
@@ -16,7 +17,6 @@ from sipe_bayes.calibration.run import run
 from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
-from sipe_bayes.diagnostics.misfit.put_in import PutIn
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.posterior import GaussianMixture, Particles, prior
 

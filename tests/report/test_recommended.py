@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 import torch
+from sipe_bayes.diagnostics.misfit.put_in import PutIn
 
 from sipe_bayes.core.findings import Code, Findings, Severity
-from sipe_bayes.diagnostics.misfit.put_in import PutIn
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.posterior import Particles
 from sipe_bayes.report.recommended import recommended

@@ -4,9 +4,9 @@ import dataclasses
 import math
 
 import pytest
+from sipe_bayes.diagnostics.misfit.put_in import PutIn
 
 from sipe_bayes.core.findings import Code, Finding, Findings, Severity
-from sipe_bayes.diagnostics.misfit.put_in import PutIn
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
 from sipe_bayes.diagnostics.records import (
     BandCoverage,

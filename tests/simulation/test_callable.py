@@ -12,11 +12,9 @@ import pytest
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import ESTIMATORS
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.windows.contact_starts import screen
 from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.inference.search.base import Search
 from sipe_bayes.likelihood.binding import bind
@@ -239,30 +237,6 @@ def always_nan(values: np.ndarray) -> np.ndarray:
 def test_wrong_input(call: Callable[[], Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         call()
-
-
-def test_many_candidates_find_a_narrow_valley() -> None:
-    """Of steps of a twentieth, where a slope tells nothing.
-
-    With 100 candidates the search begins, over ten seeds, far closer than the best of 100 draws of the prior is.
-    """
-    space = sipe.ParameterSpace(sipe.Parameter(name, low=0.0, high=1.0) for name in "abcd")
-    truth = np.array([0.31, 0.62, 0.83, 0.17])
-
-    def steps(values: np.ndarray) -> np.ndarray:
-        return np.floor(values * 20) / 20
-
-    reached, drawn = [], []
-    for seed in range(10):
-        simulator = sipe.CallableSimulator(steps, space, name="steps", likelihood=0.01)
-        estimator = Laplace(simulator, seed=seed, candidates=100)
-        trajectories = Trajectories.stack([simulator.trajectory(steps(truth[None])[0])])
-        start = screen(estimator.problem, estimator.windows(trajectories))[1]
-        draws = estimator.prior.sample((100,), generator=torch.Generator().manual_seed(seed)).numpy()
-        reached.append(np.abs(start - truth).mean())
-        drawn.append(np.abs(draws - truth).mean(1).min())
-    print(np.round(reached, 3), np.round(drawn, 3))
-    assert np.mean(reached) < 0.6 * np.mean(drawn)
 
 
 def test_pattern_search_leaves_the_false_optima_of_a_rough_misfit() -> None:

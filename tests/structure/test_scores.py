@@ -13,8 +13,8 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace.optimum import WindowOptimum
 from sipe_bayes.inference.laplace.strategy import distinct
-from sipe_bayes.inference.laplace.windows.state import WindowOptimum
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.restricted import marginal

@@ -28,6 +28,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.binding import default_likelihood
+from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 
 _OBSERVATIONS, _BUDGET, _DRAWS = 20, 10_000, 2000
@@ -69,7 +70,9 @@ def _problem(name: str) -> Problem:
         drawn = exact.draw(x, _DRAWS, np.random.default_rng([3, number]))
         logs = Trajectories.stack(simulator.trajectory(x))
         cases.append(Case(f"x {number}", logs, space.normalise(truth), reference=np.clip(space.normalise(drawn), 0, 1)))
-    return Problem(simulator, default_likelihood(simulator), tuple(cases))
+    likelihood = default_likelihood(simulator)
+    assert isinstance(likelihood, Segments)  # as of every function
+    return Problem(simulator, likelihood, tuple(cases))
 
 
 def _from_prior(space: ParameterSpace, rng: np.random.Generator) -> FloatArray:

@@ -12,7 +12,6 @@ from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.sensing import Sensing
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.windows.growing_windows import measured_starts
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
@@ -127,7 +126,7 @@ def test_windows_begin_where_a_late_sensor_will_say() -> None:
     both = Windows(Segments(), simulator, Trajectories.stack([half, log]))
     windows, off = both.part(np.flatnonzero(both.log == 1)), []
     for one in (theta, np.append(theta[:-1], 0.0)):
-        begin = windows.states(one[None], measured_starts(windows, one[None]))[0, :-1]
+        begin = windows.states(one[None], windows.no_starts(1))[0, :-1]
         off.append(np.abs(begin[:, 1:3] - truth[windows.start[:-1]]).max(0))
     print(off)
     assert off[0][1] < 0.05 * off[1][1]

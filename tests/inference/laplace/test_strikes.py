@@ -1,4 +1,4 @@
-"""What strikes is seen in the states along a log, and fitted by windows whose beginnings grow."""
+"""What strikes is seen in the states along a log, and fitted with states unknown at every sample."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.windows.growing_windows import grows
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.contacts import Contacts, contacts_along, may_touch
 from sipe_bayes.simulation.simulator import Simulator
@@ -31,10 +30,10 @@ def simulator() -> Simulator:
     return Simulator(MjcfEnvironment.build(BOUNCE, [DAMPRATIO], [], ["joint:z.position"]), num_threads=1)
 
 
-def drops(simulator: Simulator, theta: float, count: int, steps: int = 60) -> Trajectories:
+def drops(simulator: Simulator, theta: float, count: int, steps: int = 60, above: float = 0.0) -> Trajectories:
     """A ball on a slide, dropped from differing heights, at 100 Hz."""
     rng, states = np.random.default_rng(1), np.tile(simulator.default_state(), (count, 1))
-    states[:, 1], states[:, 2] = rng.uniform(0.15, 0.35, count), rng.uniform(-0.5, 0.5, count)
+    states[:, 1], states[:, 2] = above + rng.uniform(0.15, 0.35, count), rng.uniform(-0.5, 0.5, count)
     made = simulator.rollout(np.array([[theta]]), np.zeros((count, steps, 0)), states, 0.01)
     seen = made.observations + rng.normal(0, NOISE, made.observations.shape)
     return Trajectories.stack([Trajectory(own, np.zeros((steps, 0)), 0.01, name=str(k)) for k, own in enumerate(seen)])
@@ -58,13 +57,13 @@ def test_a_contact_that_comes_and_goes_is_seen(simulator: Simulator) -> None:
 
 
 def test_a_free_body_that_touches_nothing_has_no_impacts() -> None:
-    """A cube's flight is searched as joints' motions are; the same cube's landing by beginnings that grow."""
+    """A cube's flight is as smooth as joints' motions are; the same cube's landing is not."""
     flying = cube()
     for steps, landed in ((20, False), (120, True)):
         logs, _ = tosses(flying, 2, steps, seed=1)
         windows = Windows(Segments(None), flying, logs)
         assert windows.contacts.touch == landed
-        assert grows(windows) == landed
+        assert windows.impacts == landed
 
 
 def test_a_bounce_between_two_samples_is_a_touch() -> None:
@@ -79,19 +78,28 @@ def test_a_bounce_between_two_samples_is_a_touch() -> None:
         height = made.observations[0][:, 2]
         assert np.ptp(height[height.argmin() :]) > 0.1  # it went up again
         seen = with_noise(made.observations[0], body.environment.rotations, 1e-3, rng)
-        missed += not grows(
-            Windows(Segments(None), body, Trajectories.stack([Trajectory(seen, np.zeros((30, 0)), 0.01)]))
-        )
+        logs = Trajectories.stack([Trajectory(seen, np.zeros((30, 0)), 0.01)])
+        missed += not Windows(Segments(None), body, logs).impacts
     assert not missed
 
 
 def test_a_ball_on_a_slide_that_bounces(simulator: Simulator) -> None:
-    """The interval of the scatter holds the truth; the search by whole windows was hundreds of its sds off."""
+    """By default every state is unknown, and the interval holds the truth; segments are told to be wrong."""
     logs, truth = drops(simulator, 0.2, 8), 0.2
-    assert grows(Windows(Segments(None, "white"), simulator, logs))
-    method = Laplace(simulator, likelihood=Segments(None, "white"), restarts=1, seed=0)
+    assert Windows(Segments(None, "white"), simulator, logs).impacts
+    method = Laplace(simulator, seed=0)
     posterior = method.fit(logs)
+    assert isinstance(method.likelihood, StateSpace)
     mean, sd = posterior.mean.item(), posterior.stddev.item()
     assert abs(mean - truth) < 3 * sd < 0.3, (mean, sd)
     assert not method.findings.blocking
-    assert Code.SEARCH_UNSETTLED not in [item.code for item in method.findings]
+    segments = Laplace(simulator, likelihood=Segments(None, "white"), seed=0, budget=500)
+    segments.fit(logs)
+    assert Code.IMPACTS in [item.code for item in segments.findings.blocking]
+
+
+def test_logs_without_a_strike_are_fitted_by_segments(simulator: Simulator) -> None:
+    """The same ball from so high that it flies all along."""
+    method = Laplace(simulator, seed=0, budget=500)
+    method.fit(drops(simulator, 0.2, 2, above=3.0))
+    assert isinstance(method.likelihood, Segments)
