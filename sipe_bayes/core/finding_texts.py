@@ -185,8 +185,8 @@ class Code(Enum):
         "Use likelihood = 'state_space'"
     )
     BEYOND_START_NOISE = blocking(
-        "The residuals are {times:.1f} times the measurement noise at the known initial states: the search ended at a "
-        "wrong optimum, or the model lacks something. Raise the budget and the restarts"
+        "The residuals are {times:.1f} times the known measurement noise: the search ended at a wrong optimum, or the "
+        "model lacks something. Raise the budget and the restarts"
     )
     TOO_FEW_DRAWS = blocking(
         "the posterior is no normal, and {draws} draws from it came to {effective:.1f} effective ones: compare with "

