@@ -20,7 +20,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.inference.laplace.state_space.noise import NoisePosterior, infer_noise
+from sipe_bayes.core.thresholds import THRESHOLDS
+from sipe_bayes.inference.laplace.state_space.noise import NoisePosterior, excess, infer_noise
 from sipe_bayes.inference.laplace.state_space.smoother import smooth, solvable
 from sipe_bayes.inference.laplace.state_space.state import (
     ChainSearch,
@@ -72,6 +73,19 @@ class WideSearch(ChainSearch[S]):
         """Over the surroundings that are open, after short differences first."""
         return linearise_by(self.chain, here.theta, here.states, here.theta_step, here.state_step)
 
+    def onward(self, state: S) -> S:
+        """At the next starting point; at the end where the fit from this one is good.
+
+        It is where the noise has settled and is no larger than samples scatter by, no jump stands out, and process
+        noise explains little.
+        """
+        best, chain = state.recorded, self.chain
+        if best is None or not best.settled or best.outliers.any():
+            return state.next_point(self._begin)
+        little = best.absorbed < self.tuning.absorbed * chain.observed.sum()
+        good = little and excess(chain, best.sd).max() < THRESHOLDS.noise_excess
+        return replace(state, done=True) if good else state.next_point(self._begin)
+
     def wide_smooth(self, state: S, linear: ChainLinearisation) -> S:
         """A step of theta and all states."""
         return self._stepped(state, linear, solvable(linear, state.here.noise))
@@ -80,7 +94,7 @@ class WideSearch(ChainSearch[S]):
         """An estimate of the noise, which may be worth recording, and a step unless the noise gains more."""
         state, noise, ends = self.estimated(state, linear)
         if ends:
-            return state.next_point(self._begin)
+            return self.onward(state)
         if state.here.phase is Phase.NOISE:
             return self.with_differences(state, linear, noise)
         try:

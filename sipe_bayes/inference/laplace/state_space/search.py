@@ -319,7 +319,7 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         mean, covariance = self.problem.normal(state.here.theta, solved.precision, solved.gradient)
         short = state.recorded
         if short is not None and short.settled and short.resembles(mean, covariance, self.tuning.wide.alike):
-            return state.next_point(self._begin)
+            return self.onward(state)
         return self.wide_noise(state, linear)
 
     def _candidates(self, here: SmoothingPosition, linear: ChainLinearisation, noise: ChainNoise) -> BoolArray:
