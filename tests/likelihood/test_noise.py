@@ -205,20 +205,18 @@ def test_elimination_is_the_schur_complement(name: str, noise: Noise, damping: f
 @ALL
 @EVERY_NOISE
 @pytest.mark.parametrize("free", [(True, True, True), (True, False, True), (False, False, False)])
-@pytest.mark.parametrize("held", [False, True])
-def test_restricted_likelihood_is_the_dense_one(name: str, noise: Noise, free: tuple[bool, ...], held: bool) -> None:
-    """Held, it lacks what the linear model would still gain."""
+def test_restricted_likelihood_is_the_dense_one(name: str, noise: Noise, free: tuple[bool, ...]) -> None:
     case, rng = PROBLEMS[name], np.random.default_rng(2)
     pull, prior_pull = rng.normal(size=(len(case.log), D)), rng.normal(size=N)
     root = rng.normal(size=(N, N))
     prior, moving = root @ root.T + 0.1 * np.eye(N), np.array(free)
-    pulls = Pulls(prior, prior_pull, PRECISION, pull, moving, held)
+    pulls = Pulls(prior, prior_pull, PRECISION, pull, moving)
     matrix, right, log_covariance, square = system(case, noise, PRECISION, pull)
     matrix[:N, :N] += prior
     right[:N] += prior_pull
     unknown = np.concatenate([np.flatnonzero(moving), np.arange(N, len(matrix))])
     matrix, right = matrix[np.ix_(unknown, unknown)], right[unknown]
-    explained = 0.0 if held else right @ np.linalg.solve(matrix, right)
+    explained = right @ np.linalg.solve(matrix, right)
     expected = -0.5 * (log_covariance + np.linalg.slogdet(matrix)[1] + square - explained)
     close(restricted(case.moments(), noise, pulls)[0], expected)
 
@@ -265,13 +263,12 @@ def test_without_starts_the_windows_are_summed(name: str, noise: Noise, free: tu
 
 @ALL
 @EVERY_NOISE
-@pytest.mark.parametrize("held", [False, True])
-def test_the_slopes_are_those_of_the_restricted_likelihood(name: str, noise: Noise, held: bool) -> None:
+def test_the_slopes_are_those_of_the_restricted_likelihood(name: str, noise: Noise) -> None:
     """With starts, and whether or not the linear model's gain counts."""
     case, rng = PROBLEMS[name], np.random.default_rng(4)
     channels, h = case.observed.shape[2], 1e-6
     noise = Noise(noise.sd[:channels], noise.tau[:channels])
-    pulls = Pulls(np.eye(N), rng.normal(size=N), PRECISION, rng.normal(size=(len(case.log), D)), np.ones(N, bool), held)
+    pulls = Pulls(np.eye(N), rng.normal(size=N), PRECISION, rng.normal(size=(len(case.log), D)), np.ones(N, bool))
     moments = case.moments()
     value, by_sd, _ = restricted_slopes(moments, noise, pulls)
     assert value == restricted(moments, noise, pulls)[0]

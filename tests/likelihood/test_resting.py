@@ -175,8 +175,7 @@ def test_wheels_that_slip_make_simulations_jump_and_wheels_that_roll_do_not() ->
 def test_a_rovers_motors_come_back() -> None:
     """By short differences the search stayed where it began, with every slope luck."""
     simulator, log = rover()
-    settings = Segments(window=1.0, noise="white")
-    estimator = Laplace(simulator, likelihood=settings, restarts=1, candidates=0, seed=0)
+    estimator = Laplace(simulator, restarts=1, candidates=0, seed=0)
     posterior = estimator.fit(log)
     off = np.abs(posterior.mean.numpy() - simulator.space.normalise(np.array([0.5, 0.03])))
     print(off, posterior.stddev.numpy(), [f.code.name for f in estimator.findings], estimator.rollouts)

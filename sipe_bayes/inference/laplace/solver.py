@@ -195,11 +195,11 @@ class SegmentSolver:
         if options.initial is not None:
             points, valid = options.initial, True
         elif self._beginnings and options.restarts > 1:
-            points, valid = self._screened(nominal, _THROUGH_IMPACTS)
+            points, valid = self.screened(nominal, _THROUGH_IMPACTS)
         else:
-            points, valid = self._screened(nominal, 0)
+            points, valid = self.screened(nominal, 0)
             if not valid:
-                points = self._screened(nominal, options.candidates)[0][:1]
+                points = self.screened(nominal, options.candidates)[0][:1]
         if not valid:
             self.problem.find(finding(Code.DIVERGES_AS_GIVEN))
         return SolverState(points, 0, self._begin(points[0]))
@@ -292,8 +292,10 @@ class SegmentSolver:
 
     # Steps
 
-    def _screened(self, nominal: FloatArray, draws: int, number: int = 0) -> tuple[FloatArray, bool]:
-        """The nominal model (N,) and the best draws from the prior, best first; and whether the former is valid.
+    def screened(self, nominal: FloatArray, draws: int, number: int = 0) -> tuple[FloatArray, bool]:
+        """The best of the nominal model (N,) and draws from the prior, best first; and whether the former is valid.
+
+        The nominal model is among them, last at least, if it is valid.
 
         By plain residuals of the smallest part; each ``number`` has draws of its own.
         """
@@ -310,8 +312,10 @@ class SegmentSolver:
                 "shorten the model's timestep or the window"
             )
         order = np.argsort(loss, kind="stable")
-        best = [0] * bool(valid[0]) + [int(k) for k in order if k and np.isfinite(loss[k])]
-        return thetas[best[:_SCOUTS]] if draws else thetas, bool(valid[0])
+        best = [int(k) for k in order if np.isfinite(loss[k])][:_SCOUTS]
+        if valid[0] and 0 not in best:
+            best[-1] = 0
+        return thetas[best] if draws else thetas, bool(valid[0])
 
     def _profile(self, view: Windows, residual: FloatArray) -> float:
         """Energy of a residual (K, L, C) with white noise of its own size."""
@@ -634,7 +638,7 @@ class SegmentSolver:
             state, here = self._from_end(state, int(np.argmin(state.ends)))
             return replace(state, here=here)
         if state.ends and state.rounds < _ROUNDS:
-            points = self._screened(optimum.theta, _THROUGH_IMPACTS, state.rounds + 1)[0]
+            points = self.screened(optimum.theta, _THROUGH_IMPACTS, state.rounds + 1)[0]
             again = replace(state, points=points, point=0, ends=(), reached=(), rounds=state.rounds + 1)
             return replace(again, here=self._begin(points[0]))
         if self._is_poor(optimum) and not state.scouted and self.problem.options.restarts > 1:

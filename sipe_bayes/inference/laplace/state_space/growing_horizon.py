@@ -34,6 +34,10 @@ def grown(problem: SearchProblem, chain: Chain) -> FloatArray | None:
     windows.budget = problem.options.tuning.state_space.horizon * (chain.budget - chain.rollouts)
     solver, points = SegmentSolver(problem, windows), None
     try:
+        if not windows.impacts:  # else the solver looks at draws itself
+            nominal = np.clip(problem.space.default_theta, 0, 1)
+            problem = problem.within(solver.screened(nominal, 60)[0][:1])
+            solver = SegmentSolver(problem, windows)
         state = solver.start()
         solver = SegmentSolver(replace(problem, find=lambda _: None), windows)
         points = state.points[:1]

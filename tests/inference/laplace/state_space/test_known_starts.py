@@ -59,7 +59,7 @@ def grown_from(logs: list[Trajectory], **settings: object) -> tuple[np.ndarray |
 def test_many_logs_and_late_samples_grow_as_well() -> None:
     """A dozen logs, one of them alone, and one whose first samples are missing.
 
-    Each comes near the truth (the prior's mean is .37 and .12 off).
+    Each comes near the truth (the prior's mean is .37 off).
     """
     theta = np.array([0.87, 0.38, 0.5])
     logs = [bouncing_log(theta, seed, 60) for seed in range(12)]
@@ -69,7 +69,7 @@ def test_many_logs_and_late_samples_grow_as_well() -> None:
         points, estimator = grown_from(given, restarts=1)
         assert points is not None
         print(name, points, estimator.warnings)
-        assert np.abs(points[0] - theta)[:2].max() < 0.1
+        assert np.abs(points[0] - theta)[:2].max() < 0.15
 
 
 def test_a_model_that_diverges_as_given_is_said_to(monkeypatch: pytest.MonkeyPatch) -> None:
