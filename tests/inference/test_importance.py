@@ -151,10 +151,10 @@ def test_a_small_optimum_with_few_draws_is_not_its_rejected_normal() -> None:
 def test_a_given_noise_is_not_made_larger() -> None:
     """Stated sds of 1e-8 beside outputs of 1, less than what is taken for rounding where noise is estimated.
 
-    No draws, and the sd that follows; of a slope with which it is sharper than the search resolves, the least one.
+    No draws, and the sd that follows.
     """
     space = sipe.ParameterSpace([sipe.Parameter("a", 0.0, 1.0)])
-    for slope, wanted in ((5e-4, 2e-5), (1.0, 1e-6)):
+    for slope, wanted in ((5e-4, 2e-5), (1.0, 1e-8)):
         estimator = Laplace(sipe.CallableSimulator(lambda v, slope=slope: 1.0 + slope * v, space, likelihood=1e-8))
         found = estimator.fit(np.array([1.0 + 0.5 * slope]))
         print(found.stddev, estimator.diagnostics)

@@ -32,6 +32,8 @@ def grown(problem: SearchProblem, chain: Chain) -> FloatArray | None:
     logs = Trajectories.stack(list(chain.trajectories))
     windows = bind(settings, chain.simulator, logs)
     windows.budget = problem.options.tuning.state_space.horizon * (chain.budget - chain.rollouts)
+    restarts = problem.options.restarts
+    problem = replace(problem, options=replace(problem.options, restarts=max(problem.options.restarts, 2)))
     solver, points = SegmentSolver(problem, windows), None
     try:
         if not windows.impacts:  # else the solver looks at draws itself
@@ -44,7 +46,7 @@ def grown(problem: SearchProblem, chain: Chain) -> FloatArray | None:
         while not state.done:
             state = solver.step(state)
             ends = [one.theta for one in distinct(state.optima)]
-            points = np.stack(ends[: problem.options.restarts]) if ends else state.here.theta[None]
+            points = np.stack(ends[:restarts]) if ends else state.here.theta[None]
     except BudgetExhausted:
         pass  # what was found may do
     finally:
