@@ -249,8 +249,11 @@ class SegmentSolver:
     @cached_property
     def _beginnings(self) -> list[int]:
         """Control steps of the segments' beginnings that are fitted before the whole: ever more through impacts."""
-        longest = int(self.windows.steps.max())
-        return growing_steps(longest, self.tuning.growth) if self.windows.impacts else []
+        if not self.windows.impacts:
+            return []
+        seen = self.windows.observed[:, 1:].any(0)  # every channel that has samples has one in the shortest beginning
+        first = max(2, 1 + int(seen[:, seen.any(0)].argmax(0).max(initial=0)))
+        return growing_steps(first, int(self.windows.steps.max()), self.tuning.growth)
 
     def _share(self, part: int) -> float:
         """Of the segments that a part holds."""
@@ -313,7 +316,7 @@ class SegmentSolver:
             )
         order = np.argsort(loss, kind="stable")
         best = [int(k) for k in order if np.isfinite(loss[k])][:_SCOUTS]
-        if valid[0] and 0 not in best:
+        if best and valid[0] and 0 not in best:
             best[-1] = 0
         return thetas[best] if draws else thetas, bool(valid[0])
 
@@ -748,9 +751,9 @@ def spread_segments(log: IntArray, share: float) -> IntArray:
     return np.concatenate(kept)
 
 
-def growing_steps(longest: int, growth: float) -> list[int]:
-    """Control steps of beginnings that grow by a factor, from two on and below ``longest``."""
-    steps, size = [], 2.0
+def growing_steps(first: int, longest: int, growth: float) -> list[int]:
+    """Control steps of beginnings that grow by a factor, from ``first`` on and below ``longest``."""
+    steps, size = [], float(first)
     while round(size) < longest:
         steps.append(round(size))
         size = max(size * growth, size + 1)
