@@ -32,6 +32,7 @@ A. Bock's multiple shooting (1981, https://doi.org/10.1007/978-3-642-67917-5_8) 
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum, auto
 
@@ -39,7 +40,7 @@ import numpy as np
 import torch
 from scipy.stats import chi2
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.laplace.windows.energy import WindowEnergy, misfit, present_noise, same_noise, updated_noise
@@ -117,6 +118,7 @@ class SolverState(WindowState):
         wider: by how much coloured residuals make the variance of plain least squares larger than white ones would.
         scouted: whether further starting points were tried.
         behind: how many times the plain fit's that error was; 0 where it was not larger.
+        elsewhere: whether another optimum is being looked for, from where plain fits of few segments ended.
     """
 
     here: Here  # type: ignore[assignment]
@@ -126,6 +128,7 @@ class SolverState(WindowState):
     scouted: bool = False
     wider: float = 1.0
     behind: float = 0.0
+    elsewhere: bool = False
 
     @property
     def behind_noise(self) -> bool:
@@ -159,6 +162,44 @@ class _Trial:
     damping: float
 
 
+@dataclass(frozen=True)
+class _PlainStep:
+    """A step of plain least squares.
+
+    Args:
+        after: where the fit stands after it.
+        lin: the linearisation where it began.
+        hessian: (N, N), there.
+        gained: nats; not above zero where no step lowered the energy.
+        stuck: whether none is worth trying any more.
+    """
+
+    after: Here
+    lin: Linearisation
+    hessian: FloatArray
+    gained: float
+    stuck: bool
+
+    def ends(self, enough: float) -> bool:
+        """Whether a fit stands still that gains ``enough`` nats or fewer."""
+        return self.stuck or 0 < self.gained <= enough
+
+
+@dataclass(frozen=True)
+class _End:
+    """Where plain least squares ended.
+
+    Args:
+        theta: (N,).
+        energy: nats.
+        hessian: (N, N), of the energy.
+    """
+
+    theta: FloatArray
+    energy: float
+    hessian: FloatArray
+
+
 class SegmentSolver:
     """The ``Strategy`` for segments that no impact interrupts."""
 
@@ -190,13 +231,16 @@ class SegmentSolver:
         here = replace(self._begin(theta), stage=Stage.FIT)
         here = here if starts is None else replace(here, starts=starts, part=self._last(Stage.FIT))
         points = np.concatenate([state.points, theta[None]])
-        return replace(state, points=points, point=len(state.points), here=here, done=False)
+        return replace(state, points=points, point=len(state.points), here=here, elsewhere=False, done=False)
 
     def step(self, state: WindowState) -> SolverState:
         """One linearisation and the best of a batch of steps; or the comparison at the end."""
         assert isinstance(state, SolverState)
         self.windows.mask(state.wild)
         self._views = {}
+        if state.elsewhere and state.known:  # back at an optimum
+            early = state.optima[-1].finding is not None
+            return replace(state, optima=state.optima[: len(state.optima) - early], done=True)
         stages = {Stage.PLAIN: self._plain, Stage.FIT: self._fit, Stage.COMPARE: self._compare}
         return stages[state.here.stage](state)
 
@@ -336,21 +380,31 @@ class SegmentSolver:
 
     def _plain(self, state: SolverState) -> SolverState:
         here, (keep, view) = state.here, self._view(state.here.part)
-        n, starts, before = view.num_theta, view.no_starts(), lent(self.windows, view)
+        before = lent(self.windows, view)
         try:
-            scale = self._lengths(view, here)
-            axes = self._usable(here)
-            lin = view.linearise(here.theta, starts, True, False, here.residual, scale[:n], axes=axes)
-            noise = present_noise(view, lin.residual)
-            rows = (lin.jacobian / noise.sd[:, None]).reshape(-1, n)
-            precision, pull = rows.T @ rows, rows.T @ (lin.residual / noise.sd).ravel()
-            pull = pull + self.prior.pull(here.theta)
-            hessian = precision + self.prior.precision + FLAT_PRECISION * np.eye(n)
-            energy = self._profile(view, lin.residual) + self.prior.energy(here.theta)
-            thetas = np.stack([self._moved(hessian, pull, here.theta, d) for d in self._dampings(here)])
-            residuals, valid = view.residuals(thetas, np.tile(starts, (len(thetas), 1, 1)))
+            step = self._plain_step(view, here)
         finally:
             counted(self.windows, view, before)
+        after, more = step.after, self._next_part(Stage.PLAIN, here.part)
+        enough = self.tuning.plain_gain * view.num_theta * (10.0 if here.part == 0 and more else 1.0)
+        if not step.ends(enough) and after.iteration < self.tuning.most_steps:
+            return replace(state, here=after)
+        if more is not None and after.iteration < self.tuning.most_steps:
+            return replace(state, here=replace(after, part=more, residual=None))
+        return self._plain_ended(replace(state, here=here), after, step.lin, keep, view)
+
+    def _plain_step(self, view: Windows, here: Here) -> _PlainStep:
+        """One linearisation in theta alone and the best of a batch of damped steps."""
+        n, starts, scale, axes = view.num_theta, view.no_starts(), self._lengths(view, here), self._usable(here)
+        lin = view.linearise(here.theta, starts, True, False, here.residual, scale[:n], axes=axes)
+        noise = present_noise(view, lin.residual)
+        rows = (lin.jacobian / noise.sd[:, None]).reshape(-1, n)
+        precision, pull = rows.T @ rows, rows.T @ (lin.residual / noise.sd).ravel()
+        pull = pull + self.prior.pull(here.theta)
+        hessian = precision + self.prior.precision + FLAT_PRECISION * np.eye(n)
+        energy = self._profile(view, lin.residual) + self.prior.energy(here.theta)
+        thetas = np.stack([self._moved(hessian, pull, here.theta, d) for d in self._dampings(here)])
+        residuals, valid = view.residuals(thetas, np.tile(starts, (len(thetas), 1, 1)))
         energies = np.array(
             [
                 self._profile(view, r) + self.prior.energy(theta) if ok else np.inf
@@ -366,14 +420,7 @@ class SegmentSolver:
             after = replace(after, theta=thetas[best], residual=residuals[best], damping=self._damped(damping))
         else:
             after = replace(after, residual=lin.residual, damping=self._damped(damping * _DAMPINGS[-1]))
-        enough = self.tuning.plain_gain * n * (10.0 if here.part == 0 and self._next_part(Stage.PLAIN, 0) else 1.0)
-        stuck = gained <= 0 and here.damping >= 1.0
-        if (gained > enough or (gained <= 0 and not stuck)) and after.iteration < self.tuning.most_steps:
-            return replace(state, here=after)
-        part = self._next_part(Stage.PLAIN, here.part)
-        if part is not None and after.iteration < self.tuning.most_steps:
-            return replace(state, here=replace(after, part=part, residual=None))
-        return self._plain_ended(replace(state, here=here), after, lin, keep, view)
+        return _PlainStep(after, lin, hessian, gained, gained <= 0 and here.damping >= 1.0)
 
     def _plain_ended(
         self, state: SolverState, here: Here, lin: Linearisation, keep: IntArray, view: Windows
@@ -615,7 +662,7 @@ class SegmentSolver:
             return replace(state, point=point, here=self._begin(state.points[point]))
         if self.tuning.compares and not here.white and len(state.plain) and not state.freed:
             return replace(state, here=replace(here, stage=Stage.COMPARE, residual=None, starts_jacobian=None))
-        return replace(state, done=True)
+        return self._finish(state)
 
     def _recorded(self, state: SolverState, optimum: WindowOptimum) -> SolverState:
         """With an optimum in the place of what was recorded on the way to it."""
@@ -657,7 +704,7 @@ class SegmentSolver:
         ratio = self.free_run_ratio(best.theta, state.plain)
         state = replace(state, freed=True, behind=ratio if ratio > _WORSE else 0.0)
         if not state.behind:
-            return replace(state, done=True)
+            return self._finish(state)
         early = tuple(replace(one, finding=finding(Code.SEARCH_CUT_SHORT)) for one in state.optima)
         self.problem.tell("white noise, from the plain fit", self.windows.rollouts)
         here = replace(self._begin(state.plain), stage=Stage.FIT, part=1, white=True)
@@ -695,6 +742,109 @@ class SegmentSolver:
         lin = view.linearise(theta, view.no_starts(), with_theta=False)
         moments, noise = view.moments(lin, white=True), present_noise(view, lin.residual)
         return marginal(moments, noise, view.no_starts(), view.start_precision)[1]
+
+
+    # Other optima
+
+    def _finish(self, state: SolverState) -> SolverState:
+        """The end; or a further starting point, where another optimum fits as well as those recorded."""
+        windows = self.windows
+        fit = 8 * (windows.num_theta + windows.num_start + len(_DAMPINGS)) * min(self._share(2), 1.0)  # as a rule
+        if not self._is_worth_looking(state) or not windows.has_room(math.ceil(fit)):
+            return replace(state, done=True)
+        try:
+            theta = self._find_elsewhere(state)
+        except BudgetExhausted:
+            theta = None
+        if theta is None:
+            return replace(state, done=True)
+        here = replace(self._begin(theta), stage=Stage.FIT, white=state.here.white)
+        points = np.concatenate([state.points, theta[None]])
+        return replace(state, points=points, point=len(state.points), here=here, elsewhere=True)
+
+    def _is_worth_looking(self, state: SolverState) -> bool:
+        """Whether another optimum is worth looking for: plain fits tell, the fit has converged and is no poor one."""
+        options, windows = self.problem.options, self.windows
+        tells = windows.starts_measured or windows.rates_measured
+        asked = options.restarts > 1 and options.initial is None and len(state.points) < self.tuning.most_points
+        new = not any(one.holds(state.optima[-1]) for one in state.optima[:-1])
+        return asked and tells and new and not state.scouted and all(one.finding is None for one in state.optima)
+
+    def _find_elsewhere(self, state: SolverState) -> FloatArray | None:
+        """Where plain least squares fit as well as at the optima, theta (N,); None if nowhere.
+
+        From points far from the last optimum: on a few segments first, then on the smallest part.
+        """
+        last, n, optima = state.optima[-1], self.windows.num_theta, [one.theta for one in state.optima]
+        points = self._pick_far(last.theta, np.diag(last.covariance) < 0.1**2)  # of others the log says little
+        few = self._take_few((6 * len(points) + 2 * len(optima)) * (n + 3))  # most take six steps, from an optimum two
+        for view in (few, self._view(0)[1]):
+            if not points:
+                return None
+            ends = self._follow(view, optima, points)
+            points = [end.theta for end in ends[len(optima) :]]
+        return next((point for point in points if self._is_as_good(view, ends[0].theta, point)), None)
+
+    def _follow(self, view: Windows, optima: list[FloatArray], points: list[FloatArray]) -> list[_End]:
+        """Ends of plain fits from the optima; then of those from the points that end elsewhere and fit as well."""
+        before, ends = lent(self.windows, view), []
+        try:
+            for k, theta in enumerate([*optima, *points]):
+                if (end := self._descend(view, theta, ends if k >= len(optima) else [])) is not None:
+                    ends.append(end)
+        finally:
+            counted(self.windows, view, before)
+        return ends
+
+    def _pick_far(self, theta: FloatArray, narrow: BoolArray) -> list[FloatArray]:
+        """Points (N,) far from theta (N,) in the parameters that are ``narrow`` (N,), on either side of each.
+
+        Half of the way to the bounds: farther, most motions are unlike any that was logged. Then three quarters.
+        """
+        generator, out = np.random.default_rng(self.problem.seed), []
+        for way in (0.5, 0.75) if narrow.any() else ():
+            up = generator.random(len(theta)) < 0.5
+            out += [np.where(narrow, theta + way * (side - theta), theta) for side in (up, ~up)]
+        return out
+
+    def _take_few(self, thetas: int) -> Windows:
+        """So few segments that simulations of ``thetas`` take a tenth of what the fit took, mostly less; but two."""
+        windows = self.windows
+        room = 0.1 * windows.rollouts / len(windows.trajectories) * windows.num_windows / max(thetas, 1)
+        count = min(max(int(room), 2), len(self._view(0)[0]))
+        return windows.part(((np.arange(count) + 0.5) * windows.num_windows / count).astype(int))
+
+    def _descend(self, view: Windows, theta: FloatArray, known: list[_End]) -> _End | None:
+        """Where plain least squares end from theta (N,); None where that is near a known end or fits worse than it."""
+        here, n = self._begin(theta), len(theta)
+        for _ in range(8):  # two more than most take
+            step = self._plain_step(view, here)
+            here = step.after
+            if any((here.theta - end.theta) @ end.hessian @ (here.theta - end.theta) < 4 * n for end in known):
+                return None  # within two sds, on its way to that end
+            if step.ends(self.tuning.plain_gain * n):
+                break
+        assert here.residual is not None
+        energy = self._profile(view, here.residual) + self.prior.energy(here.theta)
+        # residuals larger by a tenth: initial states as measured leave some of that
+        worse = known and energy > min(end.energy for end in known) + 0.1 * view.observed.sum()
+        return None if worse else _End(here.theta, energy, step.hessian)
+
+    def _is_as_good(self, view: Windows, theta: FloatArray, other: FloatArray) -> bool:
+        """Whether another theta (N,) fits as well, and what lies between fits worse.
+
+        Fits are compared segment by segment (Q. Vuong 1989, Econometrica 57, 307). Ten nats as ``distinct``.
+        """
+        before, between = lent(self.windows, view), np.array([0.0, 1.0, 0.25, 0.5, 0.75])[:, None]
+        try:
+            thetas = theta + between * (other - theta)
+            residual, valid = view.residuals(thetas, np.tile(view.no_starts(), (len(thetas), 1, 1)))
+        finally:
+            counted(self.windows, view, before)
+        energy = 0.5 * ((residual / present_noise(view, residual[0]).sd) ** 2).sum((2, 3))
+        worse, barrier = energy[1] - energy[0], energy[2:].sum(1) - energy[:2].sum(1).max()
+        clearly = worse.sum() > max(10.0, 3.0 * np.sqrt(len(worse)) * worse.std())
+        return bool(not clearly and (barrier[valid[2:]].max(initial=-np.inf) > 10.0 or not valid.all()))
 
 
 def _log_errors(view: Windows, residual: FloatArray) -> FloatArray:
