@@ -238,9 +238,10 @@ class SegmentSolver:
         assert isinstance(state, SolverState)
         self.windows.mask(state.wild)
         self._views = {}
-        if state.elsewhere and state.known:  # back at an optimum
-            early = state.optima[-1].finding is not None
-            return replace(state, optima=state.optima[: len(state.optima) - early], done=True)
+        if state.elsewhere:
+            settled = replace(state, optima=tuple(one for one in state.optima if one.finding is None))
+            if settled.known:  # back at one of them
+                return replace(settled, done=True)
         stages = {Stage.PLAIN: self._plain, Stage.FIT: self._fit, Stage.COMPARE: self._compare}
         return stages[state.here.stage](state)
 
