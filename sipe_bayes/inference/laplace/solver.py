@@ -22,8 +22,13 @@ are those of the posterior's width, whatever dry friction or a delay does below 
 **More starting points** are followed only where the fit is poor: residuals larger than ``poor`` times what samples
 scatter by. They are the best of a few draws from the prior, fitted as in 1; the best end is kept.
 
-**Limit**: a second optimum that fits as well as the first is not looked for. Two distances of a centre of mass from its
-joint give a pendulum one period, for example; the fit then ends at the one that is nearer to the nominal model.
+**Other optima** that fit as well are looked for after the fit, unless ``restarts`` is one. Two distances of a centre of
+mass from its joint give a pendulum one period, for example. From four points far from the optimum, plain fits go down:
+on a few segments, so that all take at most about a tenth of what the fit took. One that ends elsewhere and fits as well
+goes on with the smallest part. If it still does, and what lies between fits worse, FIT follows it. Then another one is
+looked for from there. All are kept, weighted by their evidence.
+
+**Limit**: four points do not reach every optimum. Of two that a few segments do not tell apart the other is not found.
 
 A. Bock's multiple shooting (1981, https://doi.org/10.1007/978-3-642-67917-5_8) with initial states eliminated
 (``likelihood.block_tridiagonal``).
@@ -743,7 +748,6 @@ class SegmentSolver:
         lin = view.linearise(theta, view.no_starts(), with_theta=False)
         moments, noise = view.moments(lin, white=True), present_noise(view, lin.residual)
         return marginal(moments, noise, view.no_starts(), view.start_precision)[1]
-
 
     # Other optima
 
