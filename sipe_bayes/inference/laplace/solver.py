@@ -24,8 +24,8 @@ scatter by. They are the best of a few draws from the prior, fitted as in 1; the
 
 **Other optima** that fit as well are looked for after the fit, unless ``restarts`` is one. Two distances of a centre of
 mass from its joint give a pendulum one period, for example. From four points far from the optimum, plain fits go down:
-on a few segments, so that all take at most about a tenth of what the fit took. One that ends elsewhere and fits as well
-goes on with the smallest part. If it still does, and what lies between fits worse, FIT follows it. Then another one is
+on so few segments that all take a twentieth of what the fit took. One that ends elsewhere and fits as well goes on with
+the smallest part. If it still does, and what lies between fits worse, FIT follows it. Then another one is
 looked for from there. All are kept, weighted by their evidence.
 
 **Limit**: four points do not reach every optimum. Of two that a few segments do not tell apart the other is not found.
@@ -502,6 +502,8 @@ class SegmentSolver:
             return replace(state, here=replace(after, starts_jacobian=None))
         if settled or stuck or last:
             part = None if last else self._next_part(Stage.FIT, here.part)
+            if part is not None and state.elsewhere and self._is_behind(state, after, keep, view):
+                return replace(state, optima=tuple(one for one in state.optima if one.finding is None), done=True)
             if part is not None:
                 state = self._recorded(state, self._optimum(state, after, lin, moments, keep, view, False))
                 return replace(state, here=replace(after, part=part, residual=None, starts_jacobian=None))
@@ -813,27 +815,29 @@ class SegmentSolver:
         return out
 
     def _take_few(self, thetas: int) -> Windows:
-        """So few segments that simulations of ``thetas`` take a tenth of what the fit took, mostly less; but two."""
+        """So few segments that simulations of ``thetas`` take a twentieth of what the fit took, mostly less; or two."""
         windows = self.windows
-        room = 0.1 * windows.rollouts / len(windows.trajectories) * windows.num_windows / max(thetas, 1)
+        room = 0.05 * windows.rollouts / len(windows.trajectories) * windows.num_windows / max(thetas, 1)
         count = min(max(int(room), 2), len(self._view(0)[0]))
         return windows.part(((np.arange(count) + 0.5) * windows.num_windows / count).astype(int))
 
     def _descend(self, view: Windows, theta: FloatArray, known: list[_End]) -> _End | None:
         """Where plain least squares end from theta (N,); None where that is near a known end or fits worse than it."""
-        here, n = self._begin(theta), len(theta)
-        for _ in range(8):  # two more than most take
+        here, n, worst = self._begin(theta), len(theta), np.inf
+        if known:  # residuals larger by a tenth: initial states as measured leave some of that
+            worst = min(end.energy for end in known) + 0.1 * view.observed.sum()
+        for left in range(7, -1, -1):  # eight steps: two more than most take
             step = self._plain_step(view, here)
             here = step.after
+            assert here.residual is not None
+            energy = self._profile(view, here.residual) + self.prior.energy(here.theta)
             if any((here.theta - end.theta) @ end.hessian @ (here.theta - end.theta) < 4 * n for end in known):
                 return None  # within two sds, on its way to that end
+            if left < 6 and energy - left * max(step.gained, 0.0) > worst:
+                return None  # at this pace it does not get there
             if step.ends(self.tuning.plain_gain * n):
                 break
-        assert here.residual is not None
-        energy = self._profile(view, here.residual) + self.prior.energy(here.theta)
-        # residuals larger by a tenth: initial states as measured leave some of that
-        worse = known and energy > min(end.energy for end in known) + 0.1 * view.observed.sum()
-        return None if worse else _End(here.theta, energy, step.hessian)
+        return None if energy > worst else _End(here.theta, energy, step.hessian)
 
     def _is_as_good(self, view: Windows, theta: FloatArray, other: FloatArray) -> bool:
         """Whether another theta (N,) fits as well, and what lies between fits worse.
@@ -850,6 +854,19 @@ class SegmentSolver:
         worse, barrier = energy[1] - energy[0], energy[2:].sum(1) - energy[:2].sum(1).max()
         clearly = worse.sum() > max(10.0, 3.0 * np.sqrt(len(worse)) * worse.std())
         return bool(not clearly and (barrier[valid[2:]].max(initial=-np.inf) > 10.0 or not valid.all()))
+
+    def _is_behind(self, state: SolverState, here: Here, keep: IntArray, view: Windows) -> bool:
+        """Whether the best optimum fits the segments (K,) of a part better by more nats than ``distinct`` keeps."""
+        best = max((one for one in state.optima if one.finding is None), key=lambda one: one.evidence)
+        thetas, starts = np.stack([best.theta, here.theta]), np.stack([best.starts[keep], here.starts[keep]])
+        before = lent(self.windows, view)
+        try:
+            residual, valid = view.residuals(thetas, starts)
+        finally:
+            counted(self.windows, view, before)
+        energy = WindowEnergy(view, Noise(best.sd, best.tau), self.prior)
+        first, other = (energy(*one) for one in zip(thetas, starts, residual, strict=True))
+        return bool(valid.all() and other - first > 10.0 * state.wider)
 
 
 def _log_errors(view: Windows, residual: FloatArray) -> FloatArray:
