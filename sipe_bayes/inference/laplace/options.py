@@ -59,7 +59,7 @@ class LaplaceTuning(Options):
 class LaplaceOptions(Options):
     """What ``Laplace`` takes beside what every estimator takes."""
 
-    restarts: int = option(2, "starting points at most; more than one where the first fit is poor", least=1)
+    restarts: int = option(2, "starting points of a poor fit, at most; with 1 no other optimum is looked for", least=1)
     candidates: int = option(8, "points among which they are chosen: draws from the prior", least=0)
     initial: FloatArray | None = option(None, "the starting points (R, N) themselves instead", "of the cube")
     tuning: LaplaceTuning = option(LaplaceTuning(), "numbers of the search itself")

@@ -22,8 +22,13 @@ are those of the posterior's width, whatever dry friction or a delay does below 
 **More starting points** are followed only where the fit is poor: residuals larger than ``poor`` times what samples
 scatter by. They are the best of a few draws from the prior, fitted as in 1; the best end is kept.
 
-**Limit**: a second optimum that fits as well as the first is not looked for. Two distances of a centre of mass from its
-joint give a pendulum one period, for example; the fit then ends at the one that is nearer to the nominal model.
+**Other optima** that fit as well are looked for after the fit, unless ``restarts`` is one. Two distances of a centre of
+mass from its joint give a pendulum one period, for example. From four points far from the optimum, plain fits go down:
+on so few segments that all take a twentieth of what the fit took. One that ends elsewhere and fits as well goes on with
+the smallest part. If it still does, and what lies between fits worse, FIT follows it. Then another one is
+looked for from there. All are kept, weighted by their evidence.
+
+**Limit**: four points do not reach every optimum. Of two that a few segments do not tell apart the other is not found.
 
 A. Bock's multiple shooting (1981, https://doi.org/10.1007/978-3-642-67917-5_8) with initial states eliminated
 (``likelihood.block_tridiagonal``).
@@ -32,6 +37,7 @@ A. Bock's multiple shooting (1981, https://doi.org/10.1007/978-3-642-67917-5_8) 
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum, auto
 from functools import cached_property
@@ -40,7 +46,7 @@ import numpy as np
 import torch
 from scipy.stats import chi2
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.inference.laplace.energy import (
     WindowEnergy,
@@ -130,6 +136,7 @@ class SolverState(WindowState):
         reached: theta (N,) there.
         rounds: of further draws from the prior that were followed.
         behind: how many times the plain fit's that error was; 0 where it was not larger.
+        elsewhere: whether another optimum is being looked for, from where plain fits of few segments ended.
     """
 
     here: Here
@@ -142,6 +149,7 @@ class SolverState(WindowState):
     ends: tuple[float, ...] = ()
     reached: tuple[FloatArray, ...] = ()
     rounds: int = 0
+    elsewhere: bool = False
 
     @property
     def behind_noise(self) -> bool:
@@ -173,6 +181,46 @@ class _Trial:
     gained: float
     expected: float
     damping: float
+
+
+@dataclass(frozen=True)
+class _PlainStep:
+    """A step of plain least squares.
+
+    Args:
+        after: where the fit stands after it.
+        lin: the linearisation where it began.
+        hessian: (N, N), there.
+        energy: after it.
+        gained: nats; not above zero where no step lowered the energy.
+        stuck: whether none is worth trying any more.
+    """
+
+    after: Here
+    lin: Linearisation
+    hessian: FloatArray
+    energy: float
+    gained: float
+    stuck: bool
+
+    def ends(self, enough: float) -> bool:
+        """Whether a fit stands still that gains ``enough`` nats or fewer."""
+        return self.stuck or 0 < self.gained <= enough
+
+
+@dataclass(frozen=True)
+class _End:
+    """Where plain least squares ended.
+
+    Args:
+        theta: (N,).
+        energy: nats.
+        hessian: (N, N), of the energy.
+    """
+
+    theta: FloatArray
+    energy: float
+    hessian: FloatArray
 
 
 class SegmentSolver:
@@ -212,13 +260,17 @@ class SegmentSolver:
         here = replace(self._begin(theta), stage=Stage.FIT)
         here = here if starts is None else replace(here, starts=starts, part=self._last(Stage.FIT))
         points = np.concatenate([state.points, theta[None]])
-        return replace(state, points=points, point=len(state.points), here=here, done=False)
+        return replace(state, points=points, point=len(state.points), here=here, elsewhere=False, done=False)
 
     def step(self, state: WindowState) -> SolverState:
         """One linearisation and the best of a batch of steps; or the comparison at the end."""
         assert isinstance(state, SolverState)
         self.windows.mask(state.wild)
         self._views = {}
+        if state.elsewhere:
+            settled = tuple(one for one in state.optima if one.finding is None)
+            if any(is_back(state.here.theta, state.points[state.point], one) for one in settled):
+                return replace(state, optima=settled, done=True)
         stages = {Stage.PLAIN: self._plain, Stage.FIT: self._fit, Stage.COMPARE: self._compare}
         return stages[state.here.stage](state)
 
@@ -368,19 +420,33 @@ class SegmentSolver:
 
     def _plain(self, state: SolverState) -> SolverState:
         here, (keep, view) = state.here, self._view(state.here.part)
-        n, starts = view.num_theta, view.no_starts()
         with self.windows.counting(view):
-            scale = self._lengths(view, here)
-            axes = self._usable(here)
-            lin = view.linearise(here.theta, starts, True, False, here.residual, scale[:n], axes=axes)
-            noise = present_noise(view, lin.residual)
-            rows = (lin.jacobian / noise.sd[:, None]).reshape(-1, n)
-            precision, pull = rows.T @ rows, rows.T @ (lin.residual / noise.sd).ravel()
-            pull = pull + self.prior.pull(here.theta)
-            hessian = precision + self.prior.precision + FLAT_PRECISION * np.eye(n)
-            energy = self._profile(view, lin.residual) + self.prior.energy(here.theta)
-            thetas = np.stack([self._moved(hessian, pull, here.theta, d) for d in self._dampings(here)])
-            residuals, valid = view.residuals(thetas, view.no_starts(len(thetas)))
+            step = self._plain_step(view, here)
+        after, more = step.after, self._next_part(Stage.PLAIN, here.part)
+        enough = self.tuning.plain_gain * view.num_theta * (10.0 if here.part == 0 and more else 1.0)
+        if not step.ends(enough) and after.iteration < self.tuning.most_steps:
+            return replace(state, here=after)
+        if here.part == 0 and self._beginnings and len(state.ends) < len(state.points):
+            state, after = self._scouted(state, after, step.energy)
+            if after.part == 0:
+                return replace(state, here=after)
+            more = self._next_part(Stage.PLAIN, 0)
+        if more is not None and after.iteration < self.tuning.most_steps:
+            return replace(state, here=replace(after, part=more, residual=None))
+        return self._plain_ended(replace(state, here=here), after, step.lin, keep, view)
+
+    def _plain_step(self, view: Windows, here: Here) -> _PlainStep:
+        """One linearisation in theta alone and the best of a batch of damped steps."""
+        n, starts, scale, axes = view.num_theta, view.no_starts(), self._lengths(view, here), self._usable(here)
+        lin = view.linearise(here.theta, starts, True, False, here.residual, scale[:n], axes=axes)
+        noise = present_noise(view, lin.residual)
+        rows = (lin.jacobian / noise.sd[:, None]).reshape(-1, n)
+        precision, pull = rows.T @ rows, rows.T @ (lin.residual / noise.sd).ravel()
+        pull = pull + self.prior.pull(here.theta)
+        hessian = precision + self.prior.precision + FLAT_PRECISION * np.eye(n)
+        energy = self._profile(view, lin.residual) + self.prior.energy(here.theta)
+        thetas = np.stack([self._moved(hessian, pull, here.theta, d) for d in self._dampings(here)])
+        residuals, valid = view.residuals(thetas, view.no_starts(len(thetas)))
         energies = np.array(
             [
                 self._profile(view, r) + self.prior.energy(theta) if ok else np.inf
@@ -396,18 +462,7 @@ class SegmentSolver:
             after = replace(after, theta=thetas[best], residual=residuals[best], damping=self._damped(damping))
         else:
             after = replace(after, residual=lin.residual, damping=self._damped(damping * _DAMPINGS[-1]))
-        enough = self.tuning.plain_gain * n * (10.0 if here.part == 0 and self._next_part(Stage.PLAIN, 0) else 1.0)
-        stuck = gained <= 0 and here.damping >= 1.0
-        if (gained > enough or (gained <= 0 and not stuck)) and after.iteration < self.tuning.most_steps:
-            return replace(state, here=after)
-        if here.part == 0 and self._beginnings and len(state.ends) < len(state.points):
-            state, after = self._scouted(state, after, energy - max(gained, 0.0))
-            if after.part == 0:
-                return replace(state, here=after)
-        part = self._next_part(Stage.PLAIN, here.part)
-        if part is not None and after.iteration < self.tuning.most_steps:
-            return replace(state, here=replace(after, part=part, residual=None))
-        return self._plain_ended(replace(state, here=here), after, lin, keep, view)
+        return _PlainStep(after, lin, hessian, energy - max(gained, 0.0), gained, gained <= 0 and here.damping >= 1.0)
 
     def _scouted(self, state: SolverState, here: Here, energy: float) -> tuple[SolverState, Here]:
         """After a plain fit of the smallest part: from the next starting point, or on from the best end of all."""
@@ -491,6 +546,8 @@ class SegmentSolver:
             return replace(state, here=replace(after, starts_jacobian=None))
         if settled or stuck or last:
             part = None if last else self._next_part(Stage.FIT, here.part)
+            if part is not None and state.elsewhere and self._is_behind(state, after, keep, view):
+                return replace(state, optima=tuple(one for one in state.optima if one.finding is None), done=True)
             if part is not None:
                 state = self._recorded(state, self._optimum(state, after, lin, moments, keep, view, False))
                 return replace(state, here=replace(after, part=part, residual=None, starts_jacobian=None))
@@ -651,7 +708,7 @@ class SegmentSolver:
             return replace(state, point=point, here=self._begin(state.points[point]))
         if self.tuning.compares and not here.white and len(state.plain) and not state.freed:
             return replace(state, here=replace(here, stage=Stage.COMPARE, residual=None, starts_jacobian=None))
-        return replace(state, done=True)
+        return self._finish(state)
 
     def _recorded(self, state: SolverState, optimum: WindowOptimum) -> SolverState:
         """With an optimum in the place of what was recorded on the way to it."""
@@ -691,7 +748,7 @@ class SegmentSolver:
         ratio = self.free_run_ratio(best.theta, state.plain)
         state = replace(state, freed=True, behind=ratio if ratio > _WORSE else 0.0)
         if not state.behind:
-            return replace(state, done=True)
+            return self._finish(state)
         early = tuple(replace(one, finding=finding(Code.SEARCH_CUT_SHORT)) for one in state.optima)
         self.problem.tell("white noise, from the plain fit", self.windows.rollouts)
         here = replace(self._begin(state.plain), stage=Stage.FIT, part=1, white=True)
@@ -729,6 +786,127 @@ class SegmentSolver:
         lin = view.linearise(theta, view.no_starts(), with_theta=False)
         moments, noise = view.moments(lin, white=True), present_noise(view, lin.residual)
         return marginal(moments, noise, view.no_starts(), view.start_precision)[1]
+
+    # Other optima
+
+    def _finish(self, state: SolverState) -> SolverState:
+        """The end; or a further starting point, where another optimum fits as well as those recorded."""
+        windows = self.windows
+        fit = 8 * (windows.num_theta + windows.num_start + len(_DAMPINGS)) * min(self._share(2), 1.0)  # as a rule
+        if not self._is_worth_looking(state) or not windows.has_room(math.ceil(fit)):
+            return replace(state, done=True)
+        try:
+            theta = self._find_elsewhere(state)
+        except BudgetExhausted:
+            theta = None
+        if theta is None:
+            return replace(state, done=True)
+        here = replace(self._begin(theta), stage=Stage.FIT, white=state.here.white)
+        points = np.concatenate([state.points, theta[None]])
+        return replace(state, points=points, point=len(state.points), here=here, elsewhere=True)
+
+    def _is_worth_looking(self, state: SolverState) -> bool:
+        """Whether another optimum is worth looking for: plain fits tell, the fit has converged and is no poor one."""
+        options, windows = self.problem.options, self.windows
+        tells = windows.starts_measured or windows.rates_measured
+        asked = options.restarts > 1 and options.initial is None and len(state.points) < self.tuning.most_points
+        asked = asked and not self._beginnings
+        new = not any(one.holds(state.optima[-1]) for one in state.optima[:-1])
+        return asked and tells and new and not state.scouted and all(one.finding is None for one in state.optima)
+
+    def _find_elsewhere(self, state: SolverState) -> FloatArray | None:
+        """Where plain least squares fit as well as at the optima, theta (N,); None if nowhere.
+
+        From points far from the last optimum: on a few segments first, then on the smallest part.
+        """
+        last, n, optima = state.optima[-1], self.windows.num_theta, [one.theta for one in state.optima]
+        points = self._pick_far(last.theta, np.diag(last.covariance) < 0.1**2)  # of others the log says little
+        few = self._take_few((6 * len(points) + 2 * len(optima)) * (n + 3))  # most take six steps, from an optimum two
+        for view in (few, self._view(0)[1]):
+            if not points:
+                return None
+            ends = self._follow(view, optima, points)
+            points = [end.theta for end in ends[len(optima) :]]
+        return next((point for point in points if self._is_as_good(view, ends[0].theta, point)), None)
+
+    def _follow(self, view: Windows, optima: list[FloatArray], points: list[FloatArray]) -> list[_End]:
+        """Ends of plain fits from the optima; then of those from the points that end elsewhere and fit as well."""
+        ends: list[_End] = []
+        with self.windows.counting(view):
+            for k, theta in enumerate([*optima, *points]):
+                if (end := self._descend(view, theta, ends if k >= len(optima) else [])) is not None:
+                    ends.append(end)
+        return ends
+
+    def _pick_far(self, theta: FloatArray, narrow: BoolArray) -> list[FloatArray]:
+        """Points (N,) far from theta (N,) in the parameters that are ``narrow`` (N,), on either side of each.
+
+        Half of the way to the bounds: farther, most motions are unlike any that was logged. Then three quarters.
+        """
+        generator, out = np.random.default_rng(self.problem.seed), []
+        for way in (0.5, 0.75) if narrow.any() else ():
+            up = generator.random(len(theta)) < 0.5
+            out += [np.where(narrow, theta + way * (side - theta), theta) for side in (up, ~up)]
+        return out
+
+    def _take_few(self, thetas: int) -> Windows:
+        """So few segments that simulations of ``thetas`` take a twentieth of what the fit took, mostly less; or two."""
+        windows = self.windows
+        room = 0.05 * windows.rollouts / len(windows.trajectories) * windows.num_windows / max(thetas, 1)
+        count = min(max(int(room), 2), len(self._view(0)[0]))
+        return windows.part(((np.arange(count) + 0.5) * windows.num_windows / count).astype(int))
+
+    def _descend(self, view: Windows, theta: FloatArray, known: list[_End]) -> _End | None:
+        """Where plain least squares end from theta (N,); None where that is near a known end or fits worse than it."""
+        here, n, worst = self._begin(theta), len(theta), np.inf
+        if known:  # residuals larger by a tenth: initial states as measured leave some of that
+            worst = min(end.energy for end in known) + 0.1 * view.observed.sum()
+        for left in range(7, -1, -1):  # eight steps: two more than most take
+            step = self._plain_step(view, here)
+            here = step.after
+            assert here.residual is not None
+            energy = self._profile(view, here.residual) + self.prior.energy(here.theta)
+            if any((here.theta - end.theta) @ end.hessian @ (here.theta - end.theta) < 4 * n for end in known):
+                return None  # within two sds, on its way to that end
+            if left < 6 and energy - left * max(step.gained, 0.0) > worst:
+                return None  # at this pace it does not get there
+            if step.ends(self.tuning.plain_gain * n):
+                break
+        return None if energy > worst else _End(here.theta, energy, step.hessian)
+
+    def _is_as_good(self, view: Windows, theta: FloatArray, other: FloatArray) -> bool:
+        """Whether another theta (N,) fits as well, and what lies between fits worse.
+
+        Fits are compared segment by segment (Q. Vuong 1989, Econometrica 57, 307). Ten nats as ``distinct``.
+        """
+        between = np.array([0.0, 1.0, 0.25, 0.5, 0.75])[:, None]
+        with self.windows.counting(view):
+            thetas = theta + between * (other - theta)
+            residual, valid = view.residuals(thetas, view.no_starts(len(thetas)))
+        energy = 0.5 * ((residual / present_noise(view, residual[0]).sd) ** 2).sum((2, 3))
+        worse, barrier = energy[1] - energy[0], energy[2:].sum(1) - energy[:2].sum(1).max()
+        clearly = worse.sum() > max(10.0, 3.0 * np.sqrt(len(worse)) * worse.std())
+        return bool(not clearly and (barrier[valid[2:]].max(initial=-np.inf) > 10.0 or not valid.all()))
+
+    def _is_behind(self, state: SolverState, here: Here, keep: IntArray, view: Windows) -> bool:
+        """Whether the best optimum fits the segments (K,) of a part better by more nats than ``distinct`` keeps."""
+        best = max((one for one in state.optima if one.finding is None), key=lambda one: one.evidence)
+        thetas, starts = np.stack([best.theta, here.theta]), np.stack([best.starts[keep], here.starts[keep]])
+        with self.windows.counting(view):
+            residual, valid = view.residuals(thetas, starts)
+        energy = WindowEnergy(view, Noise(best.sd, best.tau), self.prior)
+        first, other = (energy(*one) for one in zip(thetas, starts, residual, strict=True))
+        return bool(valid.all() and other - first > 10.0 * state.wider)
+
+
+def is_back(theta: FloatArray, begin: FloatArray, optimum: WindowOptimum) -> bool:
+    """Whether a fit that began at a point (N,) has come, at theta (N,), to an optimum that is known.
+
+    In each principal direction of its normal within one sd, or within a tenth of the way that it had to come.
+    """
+    eigenvalues, axes = np.linalg.eigh(optimum.covariance)
+    left, whole = (np.abs((point - optimum.mean) @ axes) / np.sqrt(eigenvalues) for point in (theta, begin))
+    return bool((left < np.maximum(1.0, 0.1 * whole)).all())
 
 
 def _log_errors(view: Windows, residual: FloatArray) -> FloatArray:
