@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from sipe_bayes.simulation.callable_simulator import CallableSimulator
 
 class CallableWindows(Windows):
     """As ``likelihood.Windows``: W observed x, L = 2 samples of which the second counts, D = 0 start unknowns."""
+
+    has_parts: ClassVar[bool] = False  # fn is called for all x at once
 
     def __init__(self, settings: Segments, simulator: CallableSimulator, trajectories: Trajectories) -> None:
         self.simulator = simulator  # type: ignore[assignment]

@@ -21,6 +21,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -73,6 +74,7 @@ class Windows:
         ValueError: for logs that do not fit the simulator or the settings.
     """
 
+    has_parts: ClassVar[bool] = True
     sequences: list[Sequence]
     lead: IntArray
     begin: IntArray

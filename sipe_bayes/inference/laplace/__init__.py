@@ -33,7 +33,7 @@ mean lies beyond it, and the truncated density is right up to the bound.
 
 1. Fit, from the nominal model, and from further starting points where the fit is poor. Where it is good, look for other
    optima. Where initial states are not measured and the logs are not followed, go on from where longer segments lead
-   (``windows.longer_windows``).
+   (``longer_windows``).
 2. Keep the optima that are not the same and within ten nats of the best (``strategy.distinct``); they become components
    of a mixture, weighted by their restricted likelihood.
 3. Probe whether the optima's normals are the posterior (``inference.importance``), and whether that goes on beyond a

@@ -854,6 +854,8 @@ class SegmentSolver:
         windows = self.windows
         room = 0.05 * windows.rollouts / len(windows.trajectories) * windows.num_windows / max(thetas, 1)
         count = min(max(int(room), 2), len(self._view(0)[0]))
+        if not windows.has_parts:
+            return windows
         return windows.part(((np.arange(count) + 0.5) * windows.num_windows / count).astype(int))
 
     def _descend(self, view: Windows, theta: FloatArray, known: list[_End]) -> _End | None:
