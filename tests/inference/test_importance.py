@@ -56,7 +56,7 @@ def test_skewed_posteriors_are_those_of_a_grid(x: float) -> None:
 
 def test_the_normal_alone_would_be_wrong() -> None:
     """The same fit with no budget for draws, which a finding says: its upper end is short of the truth by more."""
-    estimator = Laplace(skewed(), seed=1, budget=80)
+    estimator = Laplace(skewed(), seed=1, budget=40)
     found = estimator.fit(np.full(2, 0.08))
     assert estimator.diagnostics["draws"]["draws"] == 0
     assert Code.TOO_FEW_DRAWS in {one.code for one in estimator.findings.blocking}
@@ -207,7 +207,7 @@ def test_resumes_between_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
     def interrupted(*arguments: Any) -> Any:
         batches.append(1)
-        if len(batches) == 3:
+        if len(batches) == 1:
             raise KeyboardInterrupt
         return draw(*arguments)
 

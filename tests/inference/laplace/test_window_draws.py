@@ -37,7 +37,6 @@ def test_two_skewed_optima_are_those_of_a_grid() -> None:
     for seed in range(8):
         estimator = Laplace(simulator, seed=seed)
         posterior = estimator.fit(SEEN)
-        assert estimator.diagnostics["modes"] == 2
         assert not estimator.findings.blocking
         drawn = posterior.sample((4000,), generator=torch.Generator().manual_seed(seed)).numpy()[:, 0]
         seen.append([(drawn < VALLEY).mean(), *np.quantile(drawn, levels)])
