@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pytest
-from sipe_bayes.diagnostics.misfit.put_in import PutIn
 
-from sipe_bayes.calibration.checks.lacking import Lacking, _Missing, _WithCauses
 from sipe_bayes.calibration.gathered import Marginals, no_rigid_bodies
 from sipe_bayes.calibration.init.check import checked
 from sipe_bayes.calibration.run import run
-from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -110,30 +106,6 @@ def test_intervals_of_a_model_that_got_what_it_lacked_stand_apart() -> None:
     space = ParameterSpace([Parameter("mass", 0.0, 8.0, targets=("body:cart.mass",), unit="kg")])
     own = marginals(space, [0.5])
     further = GaussianMixture([0.0], np.array([[0.2]]), np.array([[[0.01**2]]]), space)
-    ((low, high),) = [one.further for one in own.summaries(further, apart=True) if one.further is not None]
-    np.testing.assert_allclose([low, high], [8 * (0.2 - 0.01645), 8 * (0.2 + 0.01645)], rtol=1e-3)
-    ((around, top),) = [one.further for one in own.summaries(further) if one.further is not None]
-    assert around == low
-    assert top > 8 * 0.5
-
-
-def test_what_was_put_in_takes_the_place_of_what_is_known_to_first_order(tmp_path: Path) -> None:
-    """Also where a run that was interrupted kept it."""
-    space = ParameterSpace([Parameter("mass", 0.0, 8.0, targets=("body:cart.mass",), unit="kg")])
-    first = _Missing(np.array([[0.3], [0.4]]), np.ones(2), ("drag",), False)
-    put = PutIn("dry friction at hinge", "hinge.dry_friction", 0.2, 0.01, "N m", "add it")
-    larger = _WithCauses(np.array([[0.1], [0.2]]), np.ones(2), (put,))
-    given = Lacking(None, first, larger, (), ())
-    kept = Kept(tmp_path, "this run").of("lacking", Lacking, lambda _: given)
-    for lacks in (given, kept):
-        further = lacks.further(space)
-        assert further is not None
-        assert further.theta[:, 0].tolist() == [0.1, 0.2]
-        assert lacks.put_in == (put,)
-        assert lacks.causes == ()
-        physics = lacks.physics(space)
-        assert physics is not None
-        assert physics.causes == ("drag",)
-    plain = replace(given, larger=None)
-    assert (plain.put_in, plain.causes) == ((), ("drag",))
-    assert replace(plain, missing=None).further(space) is None
+    ((low, high),) = [one.further for one in own.summaries(further) if one.further is not None]
+    np.testing.assert_allclose(low, 8 * (0.2 - 0.01645), rtol=1e-3)
+    assert high > 8 * 0.5

@@ -188,7 +188,7 @@ def test_findings_of_one_kind_stand_together_with_what_to_do(calibration: Calibr
 def test_notes_are_in_the_page_once(calibration: Calibration) -> None:
     """What the numbers rest on; notes of a log stand with it, others where the part is that they are about."""
     notes = [
-        noticed(Code.SCATTER, severity=Severity.NOTE, text="a scatter of groups"),
+        noticed(Code.MISFIT_NOT_ASKED, severity=Severity.NOTE, text="nothing was asked"),
         noticed(Code.RESIDUALS_LEFT_OUT, severity=Severity.NOTE, text="residuals of no meaning"),
     ]
     of_log = dataclasses.replace(
@@ -196,7 +196,7 @@ def test_notes_are_in_the_page_once(calibration: Calibration) -> None:
     )
     page = Page(report.render(dataclasses.replace(calibration, findings=(*notes, of_log)), []))
     assert "What the numbers rest on: 1 note" in page.text
-    assert ADVICE[Code.SCATTER].replace("`", "") in page.text
+    assert ADVICE[Code.MISFIT_NOT_ASKED].replace("`", "") in page.text
     assert [page.text.count(item.text) for item in notes] == [1, 1]
     assert page.text.count(of_log.text) == 0  # the table of logs has it from the report of that log
     bare = Page(report.render(dataclasses.replace(calibration, findings=()), []))

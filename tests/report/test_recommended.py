@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import torch
-from sipe_bayes.diagnostics.misfit.put_in import PutIn
 
 from sipe_bayes.core.findings import Code, Findings, Severity
 from sipe_bayes.diagnostics.result import Calibration
@@ -58,18 +57,6 @@ def test_the_wider_intervals_that_are_printed_are_those_that_are_drawn() -> None
     assert "what the model lacks" in drawn.remarks()[0]
     theta = drawn.posterior.sample((2000,), generator=torch.Generator().manual_seed(1)).numpy()
     assert np.corrcoef(theta[:, 1], theta[:, 2])[0, 1] > 0.8  # 0.96 of what was given
-
-
-def test_of_a_model_that_got_what_it_lacked_and_the_plain_one_equally_many_are_drawn() -> None:
-    """P0's two normals are .1 apart, eight of the plain one's sds of .0125."""
-    given = with_further(calibration(Code.MISFIT), widths=0.01)
-    put = PutIn("drag at hinge", "hinge.drag", 0.1, 0.01, "N m s", "add it")
-    drawn = recommended(dataclasses.replace(given, put_in=(put,))).posterior
-    theta = drawn.sample((4000,), generator=torch.Generator().manual_seed(1)).numpy()[:, 0]
-    assert given.further is not None
-    plain, larger = given.posterior.mean.numpy()[0], given.further.mean.numpy()[0]
-    assert abs((abs(theta - plain) < abs(theta - larger)).mean() - 0.5) < 4 * 0.5 / np.sqrt(4000) + 0.01
-    np.testing.assert_allclose(drawn.mean.numpy()[0], (plain + larger) / 2, atol=0.005)
 
 
 def test_a_value_that_may_not_be_used_is_drawn_from_its_prior() -> None:

@@ -4,7 +4,6 @@ import dataclasses
 import math
 
 import pytest
-from sipe_bayes.diagnostics.misfit.put_in import PutIn
 
 from sipe_bayes.core.findings import Code, Finding, Findings, Severity
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
@@ -199,30 +198,8 @@ def test_what_the_model_lacks_says_where_values_would_be(calibration: Calibratio
     impacts = dataclasses.replace(calibration, findings=(noticed(Code.MISFIT_NOT_ASKED, severity=Severity.NOTE),))
     assert judged.lack(impacts) == judged.Verdict(
         "fair",
-        "Whether the model lacks something was not asked: it follows too few windows, or slips; values may lie beyond "
-        "their intervals.",
+        "Whether the model lacks something was not asked: segments meet impacts.",
     )
-
-
-def test_what_was_put_into_the_model_is_said_with_its_size(calibration: Calibration) -> None:
-    """Then the first intervals are of that model, not of what differs between logs."""
-    put = PutIn("dry friction at hinge", "hinge.dry_friction", 0.19782, 0.00086, "N m", "add joint:hinge.frictionloss")
-    slip = PutIn("slip at wheel", "wheel.slip", 0.1001, 0.0042, "1", "add it")
-    named = dataclasses.replace(LACKS, cause="dry friction at hinge", searchable=False)
-    given = dataclasses.replace(
-        calibration, misfit=named, put_in=(put, slip), findings=(noticed(Code.MISFIT_SHIFTS, "p1"),), causes=("drag",)
-    )
-    given = dataclasses.replace(given, parameters=[dataclasses.replace(parameter(0.9), further=(0.5, 1.5))])
-    lacks = judged.lack(given)
-    assert lacks is not None
-    assert lacks.tone == "fair"
-    assert lacks.text == (
-        "The model lacks something. With dry friction at hinge (0.19782 ± 0.0009 N m) and slip at wheel (0.1001 ± "
-        "0.004) put in, it leaves nothing but noise: the first intervals are of that model."
-    )
-    assert judged.between_logs(given) is None
-    assert judged.between_logs(dataclasses.replace(given, put_in=())) is not None
-    assert [row["parameter"] for row in given.to_dict()["put_in"]] == ["hinge.dry_friction", "wheel.slip"]
 
 
 def test_headline_counts_without_nuisance_parameters() -> None:
@@ -236,9 +213,8 @@ def test_headline_counts_without_nuisance_parameters() -> None:
     assert seen(good, good).text == "All 2 values may be trusted within their intervals."
     assert seen(good).tone == "good"
     words = "All 2 values may be trusted within their intervals, if the model lacks nothing."
-    for code in (Code.WINDOWS_NOT_FOLLOWED, Code.MISFIT_NOT_ASKED):
-        impacts = Findings([noticed(code, severity=Severity.NOTE)])
-        assert judged.headline([good, good], impacts) == judged.Verdict("fair", words)
+    impacts = Findings([noticed(Code.MISFIT_NOT_ASKED, severity=Severity.NOTE)])
+    assert judged.headline([good, good], impacts) == judged.Verdict("fair", words)
     assert "intervals, if the model lacks nothing: mass;" in judged.headline([good, weak], impacts).text
     assert seen(weak, weak).tone == "bad"
     assert seen(nuisance).tone == "fair"

@@ -10,7 +10,6 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.agreement import parts_of
-from sipe_bayes.diagnostics.misfit import causes
 from sipe_bayes.diagnostics.misfit.causes import sparse
 from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
@@ -91,17 +90,6 @@ def test_truths_are_held_where_the_model_lacks_dry_friction(logs: int) -> None:
     assert not plain[0, 1] <= theta[1] <= plain[1, 1]
     assert ((wide[0] <= theta) & (theta <= wide[1])).all()
     assert any("friction" in cause for cause in seen.causes)
-
-
-def test_through_impacts_the_way_of_the_causes_is_as_unsure_as_it_is_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the damping, which dry friction moves; half of the draws are those of the whole library, as before."""
-    recorded = [log(pendulum(FRICTION), [0.6, 0.08, 0.04], seed, name=f"log {seed}") for seed in range(2, 5)]
-    before = of_logs(recorded, doubted=True)[2]
-    monkeypatch.setattr(causes, "grows", lambda windows: True)
-    after = of_logs(recorded, doubted=True)[2]
-    assert after[0, 1] < before[0, 1]
-    assert after[1, 1] > before[1, 1]
-    assert 2 < (after[1, 1] - after[0, 1]) / (before[1, 1] - before[0, 1]) < 8
 
 
 def test_of_a_right_model_they_are_not_far_wider_and_hold_the_truth() -> None:
