@@ -21,7 +21,7 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.checkpoint import SearchState, Snapshot, Stored, load_state
 from sipe_bayes.core.findings import Code, Findings, finding
 from sipe_bayes.core.options import Options
@@ -361,6 +361,23 @@ class Estimator(ABC, Generic[S]):
     def describe(self, state: S) -> str:
         """What is being done, in a few words, for the progress bar."""
         return self.name
+
+    @property
+    def wild(self) -> IntArray:
+        """Samples (k, 3) that ``fit`` left out, by log, number in it and channel; none of most methods."""
+        return np.zeros((0, 3), np.int64)
+
+    def fitted_starts(self, theta: FloatArray) -> FloatArray | None:
+        """Initial states (W, D) of the segments at theta (N,), where ``fit`` estimated them."""
+        return None
+
+    def fitted_states(self, trajectories: Trajectories) -> FloatArray | None:
+        """States (R, T+1, S) of the logs of ``fit``, where it estimated them at every sample."""
+        return None
+
+    def usual_rest(self) -> float | None:
+        """Rollouts that the fit still takes as a rule; None where nothing is known of that."""
+        return None
 
     def windows(self, trajectories: Trajectories) -> Windows:
         """``bound``, for a method that takes no ``StateSpace``."""

@@ -56,7 +56,6 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.inverse_regression import Line
-from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.log_noise import NOISE_BUDGET, fitted_noise, noise_is_unknown, process_noise
 from sipe_bayes.inference.recorded import Progress, Recorded
 from sipe_bayes.likelihood.noise import Noise
@@ -274,7 +273,7 @@ class Recalibrated(Estimator[RecalibratedState]):
     def _looks_for_noise(self, trajectories: Recorded) -> bool:
         """Whether the log's noise has to be looked for with a fit of its own."""
         batch = self._given.stack(self._recorded(trajectories))
-        same = isinstance(self.estimator, Laplace) and self.likelihood.noise == "ar1"
+        same = self.estimator.name == "laplace" and self.likelihood.noise == "ar1"
         return not same and noise_is_unknown(self.simulator, self.likelihood, batch)
 
     def _noise(self, base: Estimator, theta: FloatArray, trajectories: Trajectories) -> Noise:

@@ -1,9 +1,13 @@
 """Real robots: `sipe calibrate` beside a plain least-squares fit of the same parameters, each as a command of its own.
 
     python tests/bench/everyday.py [so101 rc_car rc_car_friction] [--out FOLDER]
+    python tests/bench/everyday.py --thirds so101 --out FOLDER      # a folder that holds a run of it
 
 A row is a held-out log: the error of one free simulation by the plain fit's code, with the plain estimate and with the
 posterior mode of sipe. CPU and wall seconds are those of the whole commands.
+
+``--thirds`` fits each third of the training logs by itself, and counts how many of the three modes of each gain and
+damping lie in the 90 % intervals of the run of all data: in the plain ones, and in the discrepancy-aware ones.
 """
 
 from __future__ import annotations
@@ -18,10 +22,15 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
+
+import numpy as np
+
+from sipe_bayes.core.toml import to_toml
 
 ROOT = Path(__file__).parents[2]
 
@@ -105,6 +114,35 @@ def compare(name: str, out: Path) -> None:
     print(f"{'first estimate, s':<22}{'':>10}{first:>10}", flush=True)
 
 
+def compare_thirds(name: str, out: Path) -> None:
+    """Fit thirds of a case's training logs, and hold the modes against the intervals of the run in ``out``."""
+    path = ROOT / "examples" / CASES[name].config
+    config = tomllib.loads(path.read_text(encoding="utf-8"))
+    whole = json.loads((out / name / "result.json").read_text(encoding="utf-8"))
+    asked = [row for row in whole["parameters"] if re.search(r"_kp$|_damping$|_kv$", row["name"])]
+    inside = {"plain": 0, "discrepancy-aware": 0}
+    for part in range(3):
+        cut = {**config, "model": str(path.parent / config["model"]), "logs": []}
+        for log in config["logs"]:
+            file = path.parent / log["file"]
+            if log.get("use", "train") == "train":
+                seconds = np.loadtxt(file, delimiter=",", skiprows=1, usecols=0)
+                length = float(seconds[-1] - seconds[0]) / 3
+                span = [round(part * length, 2), round((part + 1) * length, 2)]
+                cut["logs"].append({**log, "file": str(file), "span": span})
+        given = out / f"{name}-third-{part}.toml"
+        given.write_text(to_toml(cut), encoding="utf-8")
+        run(["-m", "sipe_bayes.cli.app", "calibrate", str(given), "--out", str(out / given.stem)])
+        found = json.loads((out / given.stem / "result.json").read_text(encoding="utf-8"))
+        modes = {row["name"]: row["mode"] for row in found["parameters"]}
+        for row in asked:
+            wide = row["further"] or (row["q05"], row["q95"])
+            inside["plain"] += row["q05"] <= modes[row["name"]] <= row["q95"]
+            inside["discrepancy-aware"] += wide[0] <= modes[row["name"]] <= wide[1]
+    for kind, count in inside.items():
+        print(f"{name}: {count} of {3 * len(asked)} modes of thirds lie in the {kind} 90 % intervals of all data")
+
+
 def table(names: Sequence[str] = tuple(CASES), out: Path | None = None) -> None:
     """Compare each case; without ``out`` the runs are thrown away."""
     with tempfile.TemporaryDirectory() as scratch:
@@ -118,7 +156,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", help=f"any of {', '.join(CASES)}; default all")
     parser.add_argument("--out", type=Path, help="a new folder that keeps the runs")
+    parser.add_argument("--thirds", metavar="NAME", choices=CASES, help="hold fits of thirds against a kept run")
     given = parser.parse_args()
+    if given.thirds:
+        compare_thirds(given.thirds, given.out)
+        return
     if wrong := set(given.names) - set(CASES):
         parser.error(f"expected names of {', '.join(CASES)}, got {', '.join(sorted(wrong))}")
     table(given.names or tuple(CASES), given.out)

@@ -20,7 +20,6 @@ from sipe_bayes.diagnostics.evaluate import LOOKED_AT, best_starts, channel_nois
 from sipe_bayes.diagnostics.records import ChannelNoise, LogReport
 from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.recorded import Tell
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.noise import Noise
@@ -30,13 +29,13 @@ from sipe_bayes.likelihood.windows import Linearisation, Windows
 
 def from_fitted_states(problem: Problem, method: Estimator) -> Problem:
     """The problem with the training logs in the states where a fit with a ``StateSpace`` says that they were."""
-    states = method.fitted_states(problem.train) if isinstance(method, Laplace) else None
+    states = method.fitted_states(problem.train)
     return problem if states is None else replace(problem, train=replace(problem.train, states=states))
 
 
 def tamed(logs: Trajectories, method: Estimator) -> Trajectories:
     """The logs without the samples that the fit left out."""
-    if not isinstance(method, Laplace) or not len(method.wild):
+    if not len(method.wild):
         return logs
     observations = logs.observations.copy()
     observations[tuple(method.wild.T)] = np.nan
@@ -45,7 +44,7 @@ def tamed(logs: Trajectories, method: Estimator) -> Trajectories:
 
 def with_wild(problem: Problem, method: Estimator) -> list[LogReport]:
     """What the logs held, with the samples that the fit left out."""
-    if not isinstance(method, Laplace):
+    if not len(method.wild):
         return list(problem.reports)
     counts = {report.name: Counter(report.wild) for report in problem.reports}
     for log, _, channel in method.wild:
@@ -78,15 +77,14 @@ class Fit:
     def of(cls, problem: Problem, method: Estimator, theta: FloatArray, checks: Checks) -> Fit:
         """Of a fit that has ended."""
         windows = bind(problem.segments, problem.simulator, problem.train)
-        if isinstance(method, Laplace):
-            windows.mask(method.wild)
+        windows.mask(method.wild)
         chain = isinstance(problem.likelihood, StateSpace)
 
         def made(tell: Tell, kept: Kept) -> _At:
             noise = _noise_of(method, windows, theta)
             if chain:
                 return _At(noise, windows.no_starts())
-            starts = method.fitted_starts(theta) if isinstance(method, Laplace) else None
+            starts = method.fitted_starts(theta)
             return _At(noise, best_starts(windows, theta, noise) if starts is None else starts)
 
         at = checks.of(Check.STARTS, _At, made)

@@ -17,7 +17,6 @@ from sipe_bayes.diagnostics.identifiability import GRID
 from sipe_bayes.diagnostics.misfit.probed_logs import steps_of
 from sipe_bayes.diagnostics.prior_predictive import PREDICTIVE
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.recorded import Progress, Tell
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import StateSpace
@@ -106,7 +105,7 @@ def plan_of(problem: Problem, method: Estimator) -> Plan:
     logs, n = len(problem.train), windows.num_theta
     held = 0 if problem.holdout is None else len(problem.holdout)
     chain = isinstance(problem.likelihood, StateSpace)
-    known = chain or isinstance(method, Laplace)
+    known = chain or method.name == "laplace"
     lin = (1 + n + windows.num_start) * logs
     theta, steps = np.clip(problem.environment.space.default_theta, 0, 1), float(windows.steps.sum())
 
@@ -138,7 +137,7 @@ def with_checks(progress: Progress, plan: Plan, method: Estimator, logs: int) ->
     """The progress of a fit to so many logs that the checks come after."""
 
     def of_fit(what: str, done: int, total: int) -> None:
-        rest = method.usual_rest() if isinstance(method, Laplace) else None
+        rest = method.usual_rest()
         expected = total if rest is None else min(done + round(rest), max(total, done))
         progress(f"{what} (then checks)", done, expected + sum(plan.values()))
 
