@@ -21,6 +21,8 @@ from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_n
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 
+_FEW = 10  # measurements of known states, which tell noise to a quarter
+_SCATTERS = 1.3  # times what samples scatter by: a hundred of them tell that to a tenth
 _SAME_NOISE = 0.03  # relative: a change of an sd that moves no optimum
 
 
@@ -143,15 +145,19 @@ def judging_channels(windows: Windows) -> BoolArray:
 def beyond_known_noise(windows: Windows, sd: FloatArray, residual: FloatArray) -> float | None:
     """How many times the noise that is known a residual (W, L, C) is; None where no more than it.
 
-    Of functions the noise that they state; of logs with known initial states that of the measurements there, which
-    noise sds (C,) of the fit are held against. A thousandth of a channel's spread is no matter; of channels whose noise
-    there is less, as in simulations without noise, nothing is asked.
+    Of functions the noise that they state. Of logs with known initial states that of the measurements there, or the
+    scatter of the samples where these are few, which noise sds (C,) of the fit are held against. A thousandth of a
+    channel's spread is no matter; of channels whose noise is less, as in simulations without noise, nothing is asked.
     """
     if not isinstance(windows.simulator, Simulator) and (given := windows.fixed_sd > 0).any():
         square = float(((residual / np.where(given, windows.fixed_sd, np.inf)) ** 2).sum())
         count = int(windows.observed[..., given].sum())
         return float(np.sqrt(square / count)) if chi2.sf(square, count) < THRESHOLDS.start_noise else None
     noise, known = start_noise(windows), judging_channels(windows)
+    if windows.impacts and not windows.num_start and known.sum() < _FEW:
+        free = np.isnan(windows.fixed_sd) & (sd > 1e-3 * windows.spread)
+        times = float(np.where(free, sd / windows.level.sd, 0.0).max())
+        return times if times > _SCATTERS else None
     if not known.any():
         return None
     spread = np.maximum(windows.spread, 1e-300)

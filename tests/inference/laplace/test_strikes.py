@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from sipe_bayes.benchmark.leaderboard.task import known_start
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
@@ -16,6 +17,7 @@ from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.contacts import Contacts, contacts_along, may_touch
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.bodies import FRICTION, POSE, ROUND, cube, tosses, with_noise
+from tests.problems.bouncing import bouncing, bouncing_log
 
 BOUNCE = """<mujoco><option timestep="0.002" cone="elliptic"/><worldbody>
   <geom name="floor" type="plane" size="3 3 .1" solref=".012 1"/>
@@ -103,3 +105,19 @@ def test_logs_without_a_strike_are_fitted_by_segments(simulator: Simulator) -> N
     method = Laplace(simulator, seed=0, budget=500)
     method.fit(drops(simulator, 0.2, 2, above=3.0))
     assert isinstance(method.likelihood, Segments)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_known_states_lead_through_impacts(seed: int) -> None:
+    """A ball that bounces on a spring: right from states known at every eighth step, blocked from the first alone."""
+    theta = np.random.default_rng([seed, 1]).uniform(0.2, 0.8, 3)
+    logs = Trajectories.stack([bouncing_log(theta, seed, 120)])
+    short = Laplace(bouncing(), likelihood=Segments(8 * 0.02, "white", starts="recorded"), seed=0)
+    posterior = short.fit(known_start(logs, 8))
+    off = np.abs(posterior.mean.numpy() - theta) / posterior.stddev.numpy()
+    print(off, short.rollouts)
+    assert (off < 4).all()
+    assert not short.findings.blocking
+    whole = Laplace(bouncing(), likelihood=Segments(None, "white", starts="recorded"), seed=0)
+    whole.fit(known_start(logs))
+    assert Code.IMPACTS in [item.code for item in whole.findings.blocking]
