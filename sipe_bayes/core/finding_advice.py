@@ -177,6 +177,8 @@ ADVICE: dict[Code, str] = {
         f"{_REMEDY_LACKING} Until then read the values as those of a model that is wrong, unless the first sentences "
         "say that it was put in."
     ),
+    Code.BEHIND_PLAIN: "Initial states or noise explain what parameters should. Run `sipe discover`.",
+    Code.SEGMENTS_THINNED: "Nothing to do. To use all of them, cut the logs into several runs with `prior.from`.",
     Code.LEAST_SQUARES: "Run `sipe discover`: it looks for the physics that the model lacks.",
     Code.NOISE_DRIFTS: (
         "A model that lacks something leaves such residuals, or a zero that differs between logs: run `sipe discover`. "

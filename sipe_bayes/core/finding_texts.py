@@ -241,6 +241,11 @@ class Code(Enum):
     MISFIT_SHIFTS = caution(
         _NOT_NOISE + "; with {which} in the model the estimate would move, {moved}: {remedy}", "model lacks something"
     )
+    BEHIND_PLAIN = caution(
+        "Free simulations of the training logs miss by {error:.2g} % of the motion with the estimates, and by "
+        "{plain:.2g} % with plain least squares"
+    )
+    SEGMENTS_THINNED = note("The fit uses {used} of {segments} segments, spread evenly over the logs")
     LEAST_SQUARES = note(
         "Plain and generalised least squares differ by more than coloured noise allows (Hausman test, p < 0.001). "
         "The estimates are those of plain least squares. Their intervals allow for the correlation of the residuals"

@@ -49,9 +49,11 @@ def test_parameters_without_a_row_are_named(capsys: pytest.CaptureFixture[str]) 
 
 def test_what_no_log_tells_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     """Of notes it alone says that values may be off by more than their intervals."""
-    notes = [noticed(code, severity=Severity.NOTE, text=f"about {code.name}") for code in (Code.UNTOLD, Code.SCATTER)]
+    notes = [
+        noticed(code, severity=Severity.NOTE, text=f"about {code.name}") for code in (Code.UNTOLD, Code.LEAST_SQUARES)
+    ]
     print_calibration(replace(make_calibration(), findings=tuple(notes)))
     lines = capsys.readouterr().out.splitlines()
     assert "note: about UNTOLD" in lines
     assert "what these mean and what to do: sipe explain untold" in lines
-    assert "SCATTER" not in "".join(lines)
+    assert "LEAST_SQUARES" not in "".join(lines)

@@ -178,7 +178,7 @@ def test_the_benchmark_simulates_on_the_device_and_tells_its_records_apart(tmp_p
 def test_what_differentiates_stays_in_float64(arm: Simulator) -> None:
     exact, _, actions, starts = drawn(1)
     log = exact.rollout(np.full((1, 4), 0.4), actions, starts)
-    fits = [get_estimator(s, "laplace", budget=60, likelihood=Segments(None, starts="recorded")) for s in (exact, arm)]
+    fits = [get_estimator(s, "laplace", budget=300, likelihood=Segments(None, starts="recorded")) for s in (exact, arm)]
     alone, on_gpu = (fit.fit(log).mean.numpy() for fit in fits)
     np.testing.assert_array_equal(alone, on_gpu)
     assert Code.ON_PROCESSOR in fits[1].findings

@@ -297,7 +297,7 @@ class Laplace(Estimator[LaplaceState]):
         weight = importance.weights(draws, self.prior)
         effective = importance.effective(weight)
         enough = effective >= tuning.least
-        self._report(kept, state, enough)
+        self._report(kept, state, enough, trajectories)
         windows = self.bound(trajectories)
         if isinstance(windows, Windows) and isinstance(self.simulator, Simulator):
             assert isinstance(kept[0], WindowOptimum)
@@ -321,7 +321,7 @@ class Laplace(Estimator[LaplaceState]):
         points = np.clip(draws.points + kept[0].centre - kept[0].mean, 0.0, 1.0)
         return importance.kernels(points, weight, own, self.seed, tuning, wider)
 
-    def _report(self, kept: list[Optimum], state: LaplaceState, drawn: bool) -> None:
+    def _report(self, kept: list[Optimum], state: LaplaceState, drawn: bool, trajectories: Trajectories) -> None:
         """Diagnostics of the best optimum, and what is to be said against any that is kept.
 
         drawn: whether draws have taken the normal's place.
@@ -331,6 +331,11 @@ class Laplace(Estimator[LaplaceState]):
         if isinstance(state.search, SolverState) and state.search.behind_noise:
             self.diagnostics["least_squares"] = True
             self.find(Code.LEAST_SQUARES)
+        if isinstance(state.search, SolverState) and state.done:
+            windows = self.windows(trajectories)
+            used = SegmentSolver(self.problem, windows).count_segments()
+            if used < windows.num_windows:
+                self.find(Code.SEGMENTS_THINNED, used=used, segments=windows.num_windows)
         if isinstance(best, ChainOptimum):
             self.diagnostics |= best.diagnostics()
             if not best.settled:

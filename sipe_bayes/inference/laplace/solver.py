@@ -15,6 +15,7 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
 3. COMPARE: the plain fit and the posterior mode each run free along the whole training logs. Where the mode is worse by
    more than 3 %, coloured noise explains what parameters should. Then the estimate is that of white noise, fitted again
    from the plain fit. The interval is the sandwich (``likelihood.noise_spread``), which holds for coloured residuals.
+   Where that is worse than the plain fit, too, ``behind_plain`` says so.
 
 **Differences** of theta run along the principal axes of the posterior and are a third of its sd along each. So slopes
 are those of the posterior's width, whatever dry friction or a delay does below it.
@@ -242,7 +243,7 @@ class SegmentSolver:
         options, nominal = self.problem.options, np.clip(self.problem.space.default_theta, 0, 1)
         if options.initial is not None:
             points, valid = options.initial, True
-        elif self._beginnings and options.restarts > 1:
+        elif self._beginnings and options.restarts > 1 and self.windows.has_room(_THROUGH_IMPACTS):
             points, valid = self.screened(nominal, _THROUGH_IMPACTS)
         else:
             points, valid = self.screened(nominal, 0)
@@ -326,6 +327,10 @@ class SegmentSolver:
                 windows = windows.beginnings(self._beginnings[part])
             self._views[part] = keep, windows
         return self._views[part]
+
+    def count_segments(self) -> int:
+        """How many segments the fit uses in the end."""
+        return len(self._view(self._last(Stage.FIT))[0])
 
     def _last(self, stage: Stage) -> int:
         """The largest part that a stage simulates."""
@@ -706,7 +711,7 @@ class SegmentSolver:
         if state.point + 1 < len(state.points):
             point = state.point + 1
             return replace(state, point=point, here=self._begin(state.points[point]))
-        if self.tuning.compares and not here.white and len(state.plain) and not state.freed:
+        if self.tuning.compares and (not here.white or state.behind) and len(state.plain) and not state.freed:
             return replace(state, here=replace(here, stage=Stage.COMPARE, residual=None, starts_jacobian=None))
         return self._finish(state)
 
@@ -745,19 +750,25 @@ class SegmentSolver:
     def _compare(self, state: SolverState) -> SolverState:
         """Hold the mode's free-run error against the plain fit's."""
         best = max(state.optima, key=lambda one: one.evidence)
-        ratio = self.free_run_ratio(best.theta, state.plain)
-        state = replace(state, freed=True, behind=ratio if ratio > _WORSE else 0.0)
-        if not state.behind:
+        error, plain = self.free_run_errors(best.theta, state.plain)
+        behind = error > _WORSE * plain
+        if state.here.white:  # the second time
+            if behind:
+                self.problem.find(finding(Code.BEHIND_PLAIN, error=100 * error, plain=100 * plain))
+            return self._finish(replace(state, freed=True))
+        state = replace(state, freed=not behind, behind=error / plain if behind else 0.0)
+        if not behind:
             return self._finish(state)
         early = tuple(replace(one, finding=finding(Code.SEARCH_CUT_SHORT)) for one in state.optima)
         self.problem.tell("white noise, from the plain fit", self.windows.rollouts)
-        here = replace(self._begin(state.plain), stage=Stage.FIT, part=1, white=True)
+        part = self._last(Stage.PLAIN)
+        here = replace(self._begin(state.plain), stage=Stage.FIT, part=part, white=True)
         return replace(state, optima=early[-1:], here=here)
 
-    def free_run_ratio(self, theta: FloatArray, plain: FloatArray) -> float:
-        """How many times the free-run error of ``plain`` (N,) that of theta (N,) is: geometric mean of all logs.
+    def free_run_errors(self, theta: FloatArray, plain: FloatArray) -> tuple[float, float]:
+        """Free-run errors of theta (N,) and of ``plain`` (N,): geometric means over logs and channels.
 
-        Each training log is one simulation from the measured first state; where theta is worse from there, from the one
+        In shares of what the channels do; alike where nothing can be compared. Each training log is one simulation from the measured first state; where theta is worse from there, from the one
         that fits best. Where that follows no log, as in chaotic motion, the segments stand in its place.
         """
         windows = self.windows
@@ -771,14 +782,14 @@ class SegmentSolver:
                 sizes = np.stack([_log_errors(view, r) for r in residual])
                 moving = np.isfinite(sizes).all(0) & (sizes > view.rounding).all(0) & np.isnan(view.fixed_sd)
                 with np.errstate(divide="ignore", invalid="ignore"):
-                    follows, ratios = np.log(sizes[1] / view.spread)[moving], np.log(sizes[0] / sizes[1])[moving]
-                if not valid.all() or not moving.any() or follows.mean() > np.log(0.5):
+                    shares = np.log(sizes / view.spread)[:, moving]
+                if not valid.all() or not moving.any() or shares[1].mean() > np.log(0.5):
                     break
-                ratio = float(np.exp(ratios.mean()))
-                if ratio <= _WORSE or starts.any():
-                    return ratio
+                error, other = (float(x) for x in np.exp(shares.mean(1)))
+                if error <= _WORSE * other or starts.any():
+                    return error, other
                 starts = np.stack([self._best_starts(view, at) for at in (theta, plain)])
-        return 1.0
+        return 1.0, 1.0
 
     def _best_starts(self, view: Windows, theta: FloatArray) -> FloatArray:
         """Initial states (W, D) that fit best at theta (N,), to first order from the measured ones."""

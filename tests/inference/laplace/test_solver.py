@@ -12,7 +12,7 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.options import LaplaceTuning, SolverTuning
-from sipe_bayes.inference.laplace.solver import SolverState, spread_segments
+from sipe_bayes.inference.laplace.solver import SegmentSolver, SolverState, spread_segments
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.simulation.prompt import PromptSimulator, prompt
@@ -100,9 +100,11 @@ def test_a_model_without_friction_is_fitted_by_least_squares() -> None:
     assert method.findings.of(Code.LEAST_SQUARES)
     assert method.diagnostics["least_squares"]
     solver = method._strategy(method.bound(method._given.stack(recorded(0, seconds=16.0, friction=0.5))))
-    ratio = solver.free_run_ratio(state.search.optima[0].theta, state.search.plain)  # type: ignore[attr-defined]
-    print(ratio)
-    assert ratio < 1.05
+    best = state.search.optima[0]
+    error, plain = solver.free_run_errors(best.theta, state.search.plain)  # type: ignore[attr-defined]
+    print(error, plain)
+    assert error < 1.05 * plain
+    assert Code.BEHIND_PLAIN not in [item.code for item in method.findings]
 
 
 def test_the_plain_fit_is_told_first() -> None:
@@ -194,3 +196,22 @@ def test_initial_states_are_known_as_well_as_they_are_measured() -> None:
     print(np.quantile(size, [0.5, 0.95], axis=0))
     assert (np.quantile(size, 0.95, axis=0) < 2.0).all()
     assert (np.quantile(size, 0.95, axis=0) > 0.2).all()
+
+
+def test_an_estimate_that_stays_behind_the_plain_fit_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the fit does, free runs are said to miss by twice as much; both numbers stand in the text."""
+    monkeypatch.setattr(SegmentSolver, "free_run_errors", lambda *_: (0.04, 0.02))
+    method = Laplace(servo(), likelihood=Segments(2.0), seed=0)
+    method.fit(recorded(0, seconds=8.0))
+    (item,) = method.findings.of(Code.BEHIND_PLAIN)
+    assert "4 %" in item.text
+    assert "2 %" in item.text
+
+
+def test_the_share_of_the_segments_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    few = LaplaceTuning(solver=SolverTuning(linearised_steps=2e3))
+    method = Laplace(servo(), likelihood=Segments(0.5), seed=0, tuning=few)
+    method.fit(recorded(0, seconds=8.0))
+    (item,) = method.findings.of(Code.SEGMENTS_THINNED)
+    print(item.text)
+    assert "of 16 segments" in item.text
