@@ -160,10 +160,8 @@ def ends(posterior: Posterior) -> list[list[float]]:
 
 
 def printed(row: dict[str, Any]) -> FloatArray:
-    """What the report shows first (2, N): the plain intervals within, but where what was missing was put in."""
+    """What the report shows first (2, N): the intervals with what the model lacks, and the plain ones within."""
     plain_ends, lacking = np.array(row["ends"]["plain"]), np.array(row["ends"]["lacking"])
-    if row.get("put_in"):
-        return lacking
     return np.stack([np.minimum(plain_ends[0], lacking[0]), np.maximum(plain_ends[1], lacking[1])])
 
 
