@@ -27,7 +27,6 @@ from sipe_bayes.core.rotations import product, quaternions, rotation_vectors
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.simulation.simulator import Simulator
 
 RATE, SECONDS, SUBSTEPS = 120.0, 0.6, 4  # samples per second, a toss, physics steps between samples
@@ -84,7 +83,7 @@ def one_fit(body: str, seed: int, count: int) -> dict[str, Any]:
     theta = rng.uniform(*_INSIDE, len(machine.space))
     logs = thrown(machine, theta, count, rng)
     begin = time.monotonic(), time.process_time()
-    method = Laplace(machine, likelihood=Segments(None, "white"), seed=seed)
+    method = Laplace(machine, seed=seed)
     posterior = method.fit(logs)
     low, high = posterior.quantile([0.05, 0.95]).numpy()
     return {
@@ -120,7 +119,6 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
                 "by_parameter": dict(zip(BOUNDS, inside.mean(0).round(3).tolist(), strict=True)),
                 "median_width": dict(zip(BOUNDS, np.median(widths, 0).round(3).tolist(), strict=True)),
                 "seeds_far_off": [row["seed"] for row in mine if np.abs(row["sds_off"]).max() > _FAR],
-                "from_scatter": sum("scatter" in row["findings"] for row in mine),
                 "median_rollouts": float(np.median([row["rollouts"] for row in mine])),
                 "median_cpu_s": float(np.median([row["cpu_s"] for row in mine])),
             }

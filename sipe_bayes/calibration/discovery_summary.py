@@ -24,6 +24,7 @@ from sipe_bayes.diagnostics.evaluate import (
     errors_from_best_starts,
     fitted_residuals,
     fitted_units,
+    measured_starts,
     signals,
 )
 from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
@@ -169,7 +170,7 @@ class _Model:
     def predicted(self, windows: Windows) -> FloatArray:
         """Predictions (W, L, C) from measured starts."""
         theta = self.one.theta[None]
-        return windows.predict(theta, windows.no_starts(len(theta)))[0][0]
+        return windows.predict(theta, measured_starts(windows, theta))[0][0]
 
     @property
     def values(self) -> dict[str, float]:

@@ -274,7 +274,10 @@ class Code(Enum):
         "{count} of {steps} control steps stand out and count for little, as where a contact is missed: at {times}."
     )
     PROCESS_NOISE_SMALL = note("The model follows the logs closely{elsewhere}.")
-    PROCESS_NOISE_LARGE = note("A model that lacks nothing needs next to none: look for what it lacks there first.")
+    PROCESS_NOISE_LARGE = caution(
+        "A model that lacks nothing needs next to no process noise. Either this one lacks something there, or "
+        "measurement noise hides how stiff the contact is: then estimates may be off by several posterior sds"
+    )
 
     # logs
     WITHIN_PRIOR = note("log {log} is like simulations of the prior ({p})")

@@ -1,12 +1,13 @@
 """How well simulations follow logs: errors over open-loop windows, signals with their band, residuals.
 
 Windows start from the measured state (``likelihood.starts.estimates``), so a held-out log needs no fit of its own; a
-parameter that differs between logs takes the mean of the calibrated ones there. Of bodies that tumble the first tenth
-of a second tells the start: a slope of noisy poses is so far off that its error would hide the model's.
+parameter that differs between logs takes the mean of the calibrated ones there. Of thrown bodies the first tenth of a
+second tells the start: a slope of noisy poses is so far off that its error would hide the model's.
 """
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import replace
 
@@ -18,15 +19,18 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Residual, Signal
 from sipe_bayes.diagnostics.thinning import spread_windows
+from sipe_bayes.envs.poses import inertial_joints
 from sipe_bayes.likelihood.noise import Noise, whiten
 from sipe_bayes.likelihood.restricted import marginal
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
+from sipe_bayes.simulation.simulator import Simulator
 
 _BAND_DRAWS = 64  # of the posterior, whose 5 % and 95 % are drawn
 _NARROW, _FEW_DRAWS = 0.05, 16  # sd of the cube to which the band is to first order; of wider ones so many draws
 _SHORTER = (1.0, 0.5, 0.2, 0.05)  # steps of the starts that are tried, the next where one led uphill
 _SETTLED = 1e-3  # of the sum of squares: a step of the starts that gained less was the last
+_FIRST, _FEWEST = 0.1, 8  # s, and control steps at least: few bodies strike so soon, and six unknowns want as many
 _ITERATIONS = 2  # in which starts are looked for, near the measured ones
 LOOKED_AT = 2000  # control steps that say whether measured starts make most of an error
 _AT_LIMIT = 1e-3  # relative: so near to it a correlation time is the longest that may be
@@ -60,7 +64,7 @@ def _roots(windows: Windows, square: FloatArray) -> FloatArray:
 
 def _squares(windows: Windows, theta: FloatArray) -> FloatArray:
     """Squared errors (B, W, L, C) of theta (B, N) from measured starts, zero where nothing was measured."""
-    return _off(windows, windows.predict(theta, windows.no_starts(len(theta)))[0])
+    return _off(windows, windows.predict(theta, measured_starts(windows, theta))[0])
 
 
 def _off(windows: Windows, predicted: FloatArray) -> FloatArray:
@@ -71,7 +75,7 @@ def _off(windows: Windows, predicted: FloatArray) -> FloatArray:
 def both_predicted(windows: Windows, theta: FloatArray) -> FloatArray:
     """Predictions (2, W, L, C) from measured starts: of theta (N,) and of the model as given."""
     thetas = np.stack([theta, np.clip(windows.simulator.space.default_theta, 0, 1)])
-    return windows.predict(thetas, windows.no_starts(len(thetas)))[0]
+    return windows.predict(thetas, measured_starts(windows, thetas))[0]
 
 
 def compare_errors(
@@ -258,10 +262,10 @@ def _band(windows: Windows, theta: FloatArray, draws: FloatArray, here: FloatArr
     spread = draws.std(0)
     if spread.max() > _NARROW or len(theta) > _FEW_DRAWS:
         few = draws[:: max(1, len(draws) // _FEW_DRAWS)]
-        return windows.predict(few, windows.no_starts(len(few)))[0]
+        return windows.predict(few, measured_starts(windows, few, theta))[0]
     step = np.where(theta + spread <= 1, 1.0, -1.0) * np.maximum(spread, windows.theta_step)
     beside = theta + np.diag(step)
-    slopes = (windows.predict(beside, windows.no_starts(len(beside)))[0] - here) / step[:, None, None, None]
+    slopes = (windows.predict(beside, measured_starts(windows, beside, theta))[0] - here) / step[:, None, None, None]
     return np.asarray(here + np.tensordot(draws - theta, slopes, axes=1))
 
 
@@ -305,6 +309,22 @@ def starts_cost(windows: Windows) -> int:
 def band_cost(windows: Windows) -> int:
     """Rollouts of ``posterior_band`` at most."""
     return _FEW_DRAWS * len(windows.trajectories)
+
+
+def measured_starts(windows: Windows, theta: FloatArray, near: FloatArray | None = None) -> FloatArray:
+    """Initial states (B, W, D) of theta (B, N) for free simulations: zero is what was measured.
+
+    Of free bodies that strike something the first tenth of a second tells far more than its smoothed first sample:
+    there they are those that fit it best, of ``near`` (N,) for all or of each theta.
+    """
+    poses = isinstance(windows.simulator, Simulator) and windows.simulator.environment.poses
+    inertial = bool(poses) and bool(inertial_joints(windows.simulator.model, poses))
+    if not poses or inertial or not windows.num_start or not windows.impacts:
+        return windows.no_starts(len(theta))
+    view = windows.beginnings(max(_FEWEST, math.ceil(_FIRST / float(windows.dt.min()))))
+    with windows.counting(view):
+        own = [best_starts(view, at, view.level) for at in (theta if near is None else near[None])]
+    return np.broadcast_to(np.stack(own), (len(theta), *own[0].shape))
 
 
 def best_starts(windows: Windows, theta: FloatArray, noise: Noise) -> FloatArray:

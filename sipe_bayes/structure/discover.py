@@ -197,9 +197,8 @@ def _search(
     )
     if fitting.windows(simulator).impacts:
         raise ValueError(
-            "logs: contacts come and go along them, and through impacts two structures' fits differ by which of these "
-            "they meet, more than by what they hold; add what `sipe calibrate` names as parameters, fit again, and "
-            "compare the held-out errors"
+            "logs: bodies strike or slip along them, and fits of two structures through impacts do not compare; add "
+            "what you suspect as parameters, fit with likelihood = 'state_space', and compare the held-out errors"
         )
     most = whole("budget", budget, 1, "rollouts", MOST_ROLLOUTS)
     return StructureSearch(fitting, extensions, restriction.sites, options, most, progress, restriction.finer)

@@ -20,14 +20,12 @@ and the noise maximises its restricted likelihood, in which theta and x are inte
 with A = J' V^{-1} J + diag(0, P_x) and g what still pulls on theta: where a parameter sits at a bound, the normal's
 mean lies beyond it, and the truncated density is right up to the bound.
 
-**Three fits** share this energy, the noise by restricted likelihood and the optimum's normal (``windows.optimum``):
+**Two fits** share this energy, the noise by restricted likelihood and the optimum's normal:
 
-- ``solver.SegmentSolver`` fits segments that no impact interrupts, which is the everyday case: plain least squares
-  first, then theta, initial states and noise together, on ever more segments. Its docstring has the phases.
-- ``windows.search.WindowSearch`` fits bodies that tumble, strike or slip, by beginnings of segments that grow, and
-  chaotic or touching motion from known states. ``windows.followed`` chooses the segments that the model follows; their
-  normal is the posterior, or the scatter of groups of segments (``windows.followed_posterior``).
-- ``state_space`` fits models whose state is unknown at every sample (``StateSpace``).
+- ``solver.SegmentSolver`` fits segments, which is the everyday case: plain least squares first, then theta, initial
+  states and noise together, on ever more segments. Its docstring has the phases.
+- ``state_space`` fits models whose state is unknown at every sample (``StateSpace``): through impacts, and where not
+  every state is measured.
 
 **Steps** (``estimator.Laplace``):
 
@@ -38,7 +36,7 @@ mean lies beyond it, and the truncated density is right up to the bound.
    of a mixture, weighted by their restricted likelihood.
 3. Probe whether the optima's normals are the posterior (``inference.importance``), and whether that goes on beyond a
    single one (``inference.stretches``); where they do not stand, importance draws and kernels on them take the normals'
-   place, each optimum's on its own draws (``windows.draws``).
+   place, each optimum's on its own draws (``draws``).
 
 All are a ``strategy.Strategy``: made of a ``SearchProblem`` and the bound logs, with a frozen state of their own.
 

@@ -1,11 +1,10 @@
-"""Draws in the place of windows' normals: where one is not the posterior, or where several optima share it.
+"""Draws in the place of segments' normals: where one is not the posterior, or where several optima share it.
 
 Each optimum's normal is probed two sds along each parameter's direction (``importance.is_normal``), where starts are
 estimated only if it leaves one open, and that of a single one looked beyond (``inference.stretches``). Where all
 stand and nothing lies beyond, they are the posterior, shared by their evidence. Optima with hardly any mass are left
-out of this, and several are not asked about where starts are estimated, which follow one optimum alone; nor is one
-through impacts whose normal is that of scattered groups, or of the windows that are followed: it does not stand for
-the likelihood of all.
+out of this, and several are not asked about where starts are estimated, which follow one optimum alone; nor is any
+through impacts.
 
 The first batches come from each optimum's normal, widened, and from a normal along each stretch; the later ones from
 normals with the moments of what was drawn around an optimum (``importance.draw``).

@@ -29,6 +29,10 @@ on so few segments that all take a twentieth of what the fit took. One that ends
 the smallest part. If it still does, and what lies between fits worse, FIT follows it. Then another one is
 looked for from there. All are kept, weighted by their evidence.
 
+**Impacts** make simulations jump. There beginnings of the segments are fitted first, two control steps and then ever
+more. On the shortest ones plain fits go down from the nominal model and the best of some draws from the prior; the best
+end is followed, and the next one where residuals stay larger than the known noise (``energy.beyond_known_noise``).
+
 **Limit**: four points do not reach every optimum. Of two that a few segments do not tell apart the other is not found.
 
 A. Bock's multiple shooting (1981, https://doi.org/10.1007/978-3-642-67917-5_8) with initial states eliminated
@@ -225,7 +229,7 @@ class _End:
 
 
 class SegmentSolver:
-    """The ``Strategy`` for segments that no impact interrupts."""
+    """The ``Strategy`` for segments."""
 
     def __init__(self, problem: SearchProblem, windows: Windows) -> None:
         self.problem, self.windows = problem, windows
@@ -768,8 +772,9 @@ class SegmentSolver:
     def free_run_errors(self, theta: FloatArray, plain: FloatArray) -> tuple[float, float]:
         """Free-run errors of theta (N,) and of ``plain`` (N,): geometric means over logs and channels.
 
-        In shares of what the channels do; alike where nothing can be compared. Each training log is one simulation from the measured first state; where theta is worse from there, from the one
-        that fits best. Where that follows no log, as in chaotic motion, the segments stand in its place.
+        In shares of what the channels do; alike where nothing can be compared. Each training log is one simulation from
+        the measured first state; where theta is worse from there, from the one that fits best. Where that follows no
+        log, as in chaotic motion, the segments stand in its place.
         """
         windows = self.windows
         settings = replace(windows.settings, window=None, windows=(), noise="white", seconds=None)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.diagnostics.evaluate import measured_starts
 from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.starts.estimates import estimate_states
 from sipe_bayes.likelihood.windows import Windows
@@ -30,7 +31,7 @@ def motion(
         label: what stands beside it.
     """
     windows = Windows(replace(settings, fit=None), simulator, Trajectories.stack(log))
-    starts = windows.no_starts(len(theta))
+    starts = measured_starts(windows, np.stack(list(theta.values())))
     simulated = {}
     for name, one, start in zip(theta, theta.values(), starts, strict=True):
         begin = windows.states(one[None], start[None])[0]

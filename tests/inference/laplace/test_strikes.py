@@ -10,6 +10,7 @@ from sipe_bayes.benchmark.leaderboard.task import known_start
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.diagnostics.evaluate import measured_starts
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.likelihood.settings import Segments, StateSpace
@@ -121,3 +122,18 @@ def test_known_states_lead_through_impacts(seed: int) -> None:
     whole = Laplace(bouncing(), likelihood=Segments(None, "white", starts="recorded"), seed=0)
     whole.fit(known_start(logs))
     assert Code.IMPACTS in [item.code for item in whole.findings.blocking]
+
+
+def test_the_first_tenth_of_a_second_tells_where_a_thrown_body_starts() -> None:
+    """Velocities to the error of a straight line's slope, less than half of that of smoothed measurements."""
+    body, noise, theta = cube(), 0.004, np.array([[0.5]])
+    logs, states = tosses(body, 8, 70, seed=5, noise=noise)
+    windows, velocity = Windows(Segments(None, "white"), body, logs), slice(8, 14)
+    samples = int(0.1 / windows.dt[0]) + 2
+    slope = np.sqrt(12) * noise / (samples**1.5 * windows.dt[0])
+    error = {
+        name: np.sqrt(((windows.states(theta, starts)[0] - states[:, 0])[:, velocity] ** 2).mean())
+        for name, starts in (("told", measured_starts(windows, theta)), ("measured", windows.no_starts(1)))
+    }
+    print(error, slope)
+    assert error["told"] < 1.3 * slope < 0.5 * error["measured"]
