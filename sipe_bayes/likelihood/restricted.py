@@ -106,14 +106,24 @@ def restricted(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, Flo
     if pulls.free.any():
         free = np.ix_(pulls.free, pulls.free)
         precision = solved.precision[free] + pulls.prior[free]
-        # what rounding leaves of two parameters that do the same may be negative
-        factor = np.linalg.cholesky(precision + 1e-12 * np.diag(np.diag(precision)))
+        factor = _root(precision)
         inverse = np.linalg.inv(factor)
         half = inverse @ (solved.gradient + pulls.prior_pull)[pulls.free]
         value += 2 * float(np.log(np.diag(factor)).sum())
         gained += float(half @ half)
         move[pulls.free], covariance[free] = inverse.T @ half, inverse.T @ inverse
     return -0.5 * (value - gained), move, covariance, solved
+
+
+def _root(precision: FloatArray) -> FloatArray:
+    """Cholesky factor of a precision (N, N), of which rounding may leave a direction negative."""
+    try:
+        return np.asarray(np.linalg.cholesky(precision + 1e-12 * np.diag(np.diag(precision))))
+    except np.linalg.LinAlgError:
+        scale = np.sqrt(np.maximum(np.diag(precision), 1e-300))
+        values, axes = np.linalg.eigh(precision / np.outer(scale, scale))
+        clipped = (axes * np.maximum(values, 1e-12)) @ axes.T * np.outer(scale, scale)
+        return np.asarray(np.linalg.cholesky(clipped + 1e-12 * np.diag(np.diag(clipped))))
 
 
 def restricted_slopes(moments: Moments, noise: Noise, pulls: Pulls) -> tuple[float, FloatArray, FloatArray]:

@@ -379,8 +379,11 @@ class Laplace(Estimator[LaplaceState]):
     def usual_rest(self) -> float | None:
         """Rollouts that the fit still takes as a rule; None where nothing is known of that."""
         state, bound = self.state, self._bound
-        if state is None or bound is None or not isinstance(state.search, SolverState):
+        if state is None or bound is None:
             return None
+        if not isinstance(state.search, SolverState):  # from each starting point some 60 linearisations by all columns
+            usual = 60.0 * (state.search.point + 1) * (len(self.space) + self.num_start + 2) * len(bound[0])
+            return max(usual - self.rollouts, usual / 4)
         return SegmentSolver(self.problem, self.windows(bound[0])).usual_rest(state.search)
 
     @property
