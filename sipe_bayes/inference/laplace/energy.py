@@ -21,7 +21,6 @@ from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_n
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 
-_FEW = 10  # measurements of known states, which tell noise to a quarter
 _SCATTERS = 1.3  # times what samples scatter by: a hundred of them tell that to a tenth
 _SAME_NOISE = 0.03  # relative: a change of an sd that moves no optimum
 
@@ -154,7 +153,7 @@ def beyond_known_noise(windows: Windows, sd: FloatArray, residual: FloatArray) -
         count = int(windows.observed[..., given].sum())
         return float(np.sqrt(square / count)) if chi2.sf(square, count) < THRESHOLDS.start_noise else None
     noise, known = start_noise(windows), judging_channels(windows)
-    if windows.impacts and not windows.num_start and known.sum() < _FEW:
+    if windows.impacts and not windows.num_start and known.sum() < 10:  # so few tell noise to a quarter at best
         free = np.isnan(windows.fixed_sd) & (sd > 1e-3 * windows.spread)
         times = float(np.where(free, sd / windows.level.sd, 0.0).max())
         return times if times > _SCATTERS else None

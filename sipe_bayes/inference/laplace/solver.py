@@ -77,7 +77,6 @@ _DAMPINGS = np.array([0.03, 1.0, 30.0, 1000.0])  # tried together, times the dam
 _DIFFERENCE = 0.3  # conditional posterior sds that a finite difference is long
 _THROUGH_IMPACTS = 100  # draws from the prior, of which the best are followed where simulations jump
 _SCOUTED_STEPS = 16  # after which the next of them is followed: most fits that settle do so by then
-_ROUNDS = 2  # of further draws, where no fit settles at the noise of the known states
 _SCOUTS = 4  # of them that are followed on the shortest beginnings
 _WORSE = 1.03  # free-run error over the plain fit's from which white noise takes over
 
@@ -706,7 +705,7 @@ class SegmentSolver:
         if np.isfinite(state.ends).any():
             state, here = self._from_end(state, int(np.argmin(state.ends)))
             return replace(state, here=here)
-        if state.ends and state.rounds < _ROUNDS:
+        if state.ends and state.rounds < 2:
             points = self.screened(optimum.theta, _THROUGH_IMPACTS, state.rounds + 1)[0]
             again = replace(state, points=points, point=0, ends=(), reached=(), rounds=state.rounds + 1)
             return replace(again, here=self._begin(points[0]))
