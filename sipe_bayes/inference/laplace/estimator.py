@@ -210,8 +210,13 @@ class Laplace(Estimator[LaplaceState]):
         return replace(state, done=probe.draws is None or not windows.has_room(draw_size(self.problem, windows, kept)))
 
     def _may_lead(self, chain: Chain, search: WindowState | StateSpaceState | KnownStartState) -> bool:
-        """Whether a finished search may go on from where segments lead: once, where not every state is measured."""
-        return isinstance(search, StateSpaceState) and not search.led and not chain.determined.all()
+        """Whether a finished search may go on from where segments lead: once, where not every state is measured.
+
+        Not through impacts, which segments do not follow.
+        """
+        if not isinstance(search, StateSpaceState) or search.led or chain.determined.all():
+            return False
+        return not any(isinstance(one, ChainOptimum) and one.rough for one in search.optima)
 
     def _lost(self, chain: Chain, optimum: Optimum, search: WindowState | StateSpaceState | KnownStartState) -> bool:
         """Whether process noise explains much of a log of which not every state is told: segments may need less."""
