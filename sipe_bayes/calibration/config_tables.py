@@ -368,8 +368,8 @@ class Search(Table):
     """How widely the optimum is looked for."""
 
     restarts: Annotated[int, Strict(), Field(gt=0, le=10_000)] = 2
-    """of `laplace` and `mcmc`: starting points at most; logs without impacts get more than one where the fit is poor;
-    with 1 `laplace` looks for no other optimum where it is good"""
+    """of `laplace` and `mcmc`: starting points at most; more than one where the fit is poor; with 1 `laplace` looks for
+    no other optimum where it is good"""
     candidates: Annotated[int, Strict(), Field(ge=0, le=1_000_000)] = 8
     """how many points are simulated to choose them from, besides the model as given. They are drawn from the
     prior; from 40 on, the later ones around the best so far"""

@@ -16,7 +16,6 @@ _BOUNDS = (
     "estimate may be right and its interval one-sided. A value that runs away often stands for physics that the model "
     "lacks, or for a wrong sign or unit."
 )
-_SMOOTHER = "Use shorter windows, or drop the parameters that make the simulation rough, as stiffness of a contact."
 
 ADVICE: dict[Code, str] = {
     Code.BUDGET_SPENT: (
@@ -173,10 +172,7 @@ ADVICE: dict[Code, str] = {
     Code.NO_MISFIT: "Nothing to do. The cause that is named is the one that would have been looked at first.",
     Code.SMALL_MISFIT: "The values may be used. For a better prediction put the cause into the model.",
     Code.MISFIT: _REMEDY_LACKING,
-    Code.MISFIT_SHIFTS: (
-        f"{_REMEDY_LACKING} Until then read the values as those of a model that is wrong, unless the first sentences "
-        "say that it was put in."
-    ),
+    Code.MISFIT_SHIFTS: (f"{_REMEDY_LACKING} Until then read the values as those of a model that is wrong."),
     Code.BEHIND_PLAIN: "Initial states or noise explain what parameters should. Run `sipe discover`.",
     Code.SEGMENTS_THINNED: "Nothing to do. To use all of them, cut the logs into several runs with `prior.from`.",
     Code.LEAST_SQUARES: "Run `sipe discover`: it looks for the physics that the model lacks.",
@@ -200,7 +196,7 @@ ADVICE: dict[Code, str] = {
     Code.PROCESS_NOISE: "What the model lacks acts there. A few per cent are usual of a good model.",
     Code.PROCESS_OUTLIERS: "Look at the log at these times: a kick, a contact, a sample that was lost.",
     Code.PROCESS_NOISE_SMALL: "Nothing to do.",
-    Code.PROCESS_NOISE_LARGE: "Fit the same log with windows and run `sipe discover`, which names what is lacking.",
+    Code.PROCESS_NOISE_LARGE: "Add what you suspect as parameters, or measure with less noise.",
     Code.WITHIN_PRIOR: "Nothing to do.",
     Code.OUTSIDE_PRIOR: (
         "No values within the bounds simulate such a log. First suspects: unit or sign of that channel, a delay, a "

@@ -321,9 +321,9 @@ def measured_starts(windows: Windows, theta: FloatArray, near: FloatArray | None
     inertial = bool(poses) and bool(inertial_joints(windows.simulator.model, poses))
     if not poses or inertial or not windows.num_start or not windows.impacts:
         return windows.no_starts(len(theta))
-    view = windows.beginnings(max(_FEWEST, math.ceil(_FIRST / float(windows.dt.min()))))
+    view = windows.beginnings(windows.telling_steps(max(_FEWEST, math.ceil(_FIRST / float(windows.dt.min())))))
     with windows.counting(view):
-        own = [best_starts(view, at, view.level) for at in (theta if near is None else near[None])]
+        own = [best_starts(view, at, windows.level) for at in (theta if near is None else near[None])]
     return np.broadcast_to(np.stack(own), (len(theta), *own[0].shape))
 
 

@@ -56,8 +56,7 @@ class ParameterSummary:
         contraction: 1 - sd / prior sd.
         nuisance: whether it holds for one log alone.
         further: (2,) 5 and 95 % quantiles with what the model may lack; where the logs ask for different values or the
-            model lacks something, of what a further log would ask for, or of the model with what it lacks put in, which
-            need not hold the others. None where neither can be said.
+            model lacks something, of what a further log would ask for. None where neither can be said.
         known: whether the prior alone determines it well, and the logs do not say otherwise.
     """
 

@@ -218,7 +218,7 @@ class Estimator(ABC, Generic[S]):
             CheckpointError: for a checkpoint that is damaged or of another run.
         """
         batch, ends = self._given.stack(self._recorded(trajectories), anew=True), time.monotonic() + self.time_limit
-        self.likelihood = default_likelihood(self.simulator, batch) if self._own_likelihood else self.likelihood
+        self.choose_likelihood(batch)
         self.budget = self.budget_for(batch) if self._own_budget else self.budget
         fingerprint = self._fingerprint(batch)
         self.findings, self.diagnostics, self.rollouts, self._bound = Findings(), {}, 0, None
@@ -261,6 +261,7 @@ class Estimator(ABC, Generic[S]):
         """
         batch, last = self._given.stack(self._recorded(trajectories)), self._last
         if last is None:
+            self.choose_likelihood(batch)
             self._run, last = self._fingerprint(batch), self._started(batch)
         if not last.state.done:
             self.go_on_from(last)
@@ -276,6 +277,11 @@ class Estimator(ABC, Generic[S]):
             raise ValueError("get_parameter_estimate: nothing is fitted yet; call update_parameter_estimate first")
         self.go_on_from(self._last)
         return self._finished(self._last.state, self._given.stack(self._recorded(trajectories)))
+
+    def choose_likelihood(self, batch: Trajectories) -> None:
+        """The likelihood that suits the logs, where none was given."""
+        if self._own_likelihood:
+            self.likelihood = default_likelihood(self.simulator, batch)
 
     def _started(self, batch: Trajectories) -> Snapshot[S]:
         """The first state, kept."""

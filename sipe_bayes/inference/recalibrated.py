@@ -177,13 +177,20 @@ class Recalibrated(Estimator[RecalibratedState]):
         self._proposals: tuple[tuple[bytes, bytes], FloatArray] | None = None
         self._seconds: float | None = None
 
+    def choose_likelihood(self, batch: Trajectories) -> None:
+        """That of the estimator."""
+        self.estimator.choose_likelihood(batch)
+        self.likelihood = self.estimator.likelihood
+
     def settings(self) -> dict[str, object]:
         """As every estimator's, and the other one's."""
         return {**super().settings(), "budget": self._asked, "refits": self.refits, "of": self.estimator.settings()}
 
     def cost(self, trajectories: Recorded) -> int:
         """Rollouts that ``fit`` takes at most."""
-        logs = len(self._given.stack(self._recorded(trajectories)))
+        batch = self._given.stack(self._recorded(trajectories))
+        self.choose_likelihood(batch)
+        logs = len(batch)
         each = logs if self.estimator.amortised else logs + self.estimator.budget
         return self.estimator.budget + self.refits * each + self._looks_for_noise(trajectories) * NOISE_BUDGET
 

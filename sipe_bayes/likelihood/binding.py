@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import overload
 
-from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood.callable_windows import CallableWindows
 from sipe_bayes.likelihood.settings import Segments, StateSpace, check_seen
 from sipe_bayes.likelihood.starts.estimates import contacts_of
@@ -55,6 +56,16 @@ def _chain(settings: StateSpace, simulator: Simulator | CallableSimulator, traje
     return chain
 
 
+def wants_state_space(simulator: Simulator, logs: Sequence[Trajectory]) -> bool:
+    """Whether bodies strike or slip along logs, and a ``StateSpace`` can be had: without memory, all sensors prompt."""
+    environment = simulator.environment
+    if not logs or environment.memory_size or not may_touch(simulator.model):
+        return False
+    if (environment.remembers > min(log.dt for log in logs)).any():
+        return False
+    return meets_impacts(simulator, contacts_of(simulator, logs))
+
+
 def default_likelihood(
     simulator: Simulator | CallableSimulator, trajectories: Trajectories | None = None
 ) -> Segments | StateSpace:
@@ -63,12 +74,7 @@ def default_likelihood(
     Of a function white noise of the sd that it states, zero where it makes its own.
     """
     if not isinstance(simulator, CallableSimulator):
-        environment = simulator.environment
-        if trajectories is None or environment.memory_size or not may_touch(simulator.model):
-            return Segments()
-        if (environment.remembers > trajectories.dt.min()).any():
-            return Segments()
-        logs = [replace(log, states=None) for log in trajectories]
-        return StateSpace() if meets_impacts(simulator, contacts_of(simulator, logs)) else Segments()
+        logs = [] if trajectories is None else [replace(log, states=None) for log in trajectories]
+        return StateSpace() if wants_state_space(simulator, logs) else Segments()
     sd = simulator.noise_sd or (0.0,) * len(simulator.environment.channels)
     return Segments(None, noise="white", noise_sd=sd, starts="recorded")

@@ -213,6 +213,11 @@ class Windows:
         self._masked = len(samples)
         self._in_order()
 
+    def telling_steps(self, least: int) -> int:
+        """Control steps, at least so many, after whose beginning every channel that has samples has one."""
+        seen = self.observed[:, 1:].any(0)
+        return max(least, 1 + int(seen[:, seen.any(0)].argmax(0).max(initial=0)))
+
     def beginnings(self, steps: int) -> Windows:
         """The first control ``steps`` of every window, as its latest sensor sees them; itself where none is longer."""
         steps += int(max(self.lead.max(), self.begin.max(1).min()))

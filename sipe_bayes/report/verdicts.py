@@ -360,9 +360,6 @@ def _allowed_for(calibration: Calibration) -> Verdict:
     """How much wider intervals are for what does not show."""
     pairs = [(p.further, (p.q05, p.q95)) for p in calibration.parameters if p.further is not None]
     wider = max((high - low) / (b - a) if b > a else 1.0 for (low, high), (a, b) in pairs)
-    if Findings(calibration.findings).of(Code.MISFIT_NOT_ASKED):
-        text = "The first intervals hold what differs between the logs"
-        return Verdict("fair", f"{text}, at most {wider:.1f} times as wide as the plain ones.")
     text = f"Nothing is seen to be missing; the first intervals, at most {100 * (wider - 1):.0f} % wider than the plain"
     return Verdict("good", f"{text} ones, allow for what would not show, most of all {listed(_named(calibration))}.")
 

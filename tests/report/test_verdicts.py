@@ -311,9 +311,6 @@ def test_where_nothing_is_seen_to_be_missing_values_are_trusted_and_what_would_n
     words = "at most 20 % wider than the plain ones, allow for what would not show, most of all delay, drag and others."
     assert said.text.endswith(words)
     assert "with what the model may lack" in report.render(quiet, [])
-    unasked = dataclasses.replace(quiet, causes=(), findings=(noticed(Code.MISFIT_NOT_ASKED, severity=Severity.NOTE),))
-    words = "between the logs, at most 1.2 times as wide as the plain ones.')"
-    assert str(judged.between_logs(unasked)).endswith(words)
     seen = dataclasses.replace(quiet, findings=(noticed(Code.SMALL_MISFIT),))
     assert "with what the model lacks" in report.render(seen, [])
     assert "hold what differs" in str(judged.between_logs(seen))

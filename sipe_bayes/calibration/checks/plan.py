@@ -124,7 +124,7 @@ def plan_of(problem: Problem, method: Estimator) -> Plan:
     return {
         Check.STARTS: 0 if known else 2 * search,
         Check.LOGS: (alone if chain else round(lin * share(LOOKED_AT))) if logs > 1 and not windows.impacts else 0,
-        Check.LACKING: lacking if chain else lacking + logs,
+        Check.LACKING: 0 if chain or windows.impacts else lacking + logs,
         Check.PREDICTIONS: 2 * (logs + held),
         Check.COMPARISON: round(search * share(LOOKED_AT) * (logs + held)) // logs,
         Check.PRIOR: round(PREDICTIVE.simulations * logs * share(PREDICTIVE.steps)),

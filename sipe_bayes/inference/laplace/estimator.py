@@ -69,8 +69,9 @@ class Laplace(Estimator[LaplaceState]):
     """Box-constrained least squares, noise by restricted likelihood; in seconds. A GaussianMixture of the optima.
 
     Args:
-        restarts: starting points at most; segments without impacts get more than one where the fit is poor. With 1 no
-            other optimum is looked for where it is good.
+        restarts: starting points at most; more than one where the fit is poor. From known states through impacts the
+            best of four are followed, and as many again, at most twice. With 1 there is one, and no second optimum is
+            looked for.
         candidates: points among which they are chosen: draws from the prior and, of 40 or more, later ones around the
             best; without effect where ``state_space.known_starts`` finds them.
         initial: (R, N), the starting points themselves instead.

@@ -28,11 +28,13 @@ class WindowOptimum(Optimum):
         starts: (W, D), initial states.
         slope: (W, D, N): initial states follow theta by minus this.
         finding: why its intervals are not to be trusted; None where they may be.
+        early: whether it is of a stage on the way, perhaps of fewer samples than the end.
     """
 
     starts: FloatArray
     slope: FloatArray
     finding: Finding | None = None
+    early: bool = False
 
 
 @dataclass(frozen=True)

@@ -246,7 +246,7 @@ class SegmentSolver:
         options, nominal = self.problem.options, np.clip(self.problem.space.default_theta, 0, 1)
         if options.initial is not None:
             points, valid = options.initial, True
-        elif self._beginnings and options.restarts > 1 and self.windows.has_room(_THROUGH_IMPACTS):
+        elif self._beginnings and options.restarts > 1 and self._may_screen():
             points, valid = self.screened(nominal, _THROUGH_IMPACTS)
         else:
             points, valid = self.screened(nominal, 0)
@@ -261,10 +261,10 @@ class SegmentSolver:
         assert isinstance(state, SolverState)
         if len(state.points) >= self.tuning.most_points or self._leaves_no_room():
             return None
-        here = replace(self._begin(theta), stage=Stage.FIT)
+        here = replace(self._begin(theta), stage=Stage.FIT, white=state.here.white)
         here = here if starts is None else replace(here, starts=starts, part=self._last(Stage.FIT))
         points = np.concatenate([state.points, theta[None]])
-        return replace(state, points=points, point=len(state.points), here=here, elsewhere=False, done=False)
+        return replace(state, points=points, point=len(state.points), here=here, elsewhere=False, ends=(), done=False)
 
     def step(self, state: WindowState) -> SolverState:
         """One linearisation and the best of a batch of steps; or the comparison at the end."""
@@ -272,7 +272,7 @@ class SegmentSolver:
         self.windows.mask(state.wild)
         self._views = {}
         if state.elsewhere:
-            settled = tuple(one for one in state.optima if one.finding is None)
+            settled = tuple(one for one in state.optima if not one.early)
             if any(is_back(state.here.theta, state.points[state.point], one) for one in settled):
                 return replace(state, optima=settled, done=True)
         stages = {Stage.PLAIN: self._plain, Stage.FIT: self._fit, Stage.COMPARE: self._compare}
@@ -291,12 +291,16 @@ class SegmentSolver:
         """Rollouts that a fit still takes as a rule, by the steps that real arms and servos took of each stage."""
         windows, here = self.windows, state.here
         n, d, logs = windows.num_theta, windows.num_start, len(windows.trajectories)
+        whole = len(self._beginnings)  # the first part of whole segments
         course = [(Stage.PLAIN, 0, 6), (Stage.PLAIN, 1, 6), (Stage.FIT, 1, 4), (Stage.FIT, 2, 4)]
+        course = [(stage, part + whole, steps) for stage, part, steps in course]
         look = 0.0 if state.behind_noise or state.done else 2.0 * (1 + 4 * n)  # at what lies beyond the normal
-        now = next((k for k, (stage, part, _) in enumerate(course) if (stage, part) == (here.stage, here.part)), 3)
+        now = next(
+            (k for k, (stage, part, _) in enumerate(course) if (stage, part) == (here.stage, max(here.part, whole))), 3
+        )
         for k, (stage, part, steps) in enumerate(course[now:] if not state.done else ()):
             columns = n + (d if stage is Stage.FIT else 0) + len(_DAMPINGS)
-            new = part == 0 or self._share(part - 1) < 1 or stage is not course[max(now + k - 1, 0)][0]
+            new = part == whole or self._share(part - 1) < 1 or stage is not course[max(now + k - 1, 0)][0]
             look += steps * (0.5 if k == 0 else 1.0) * columns * min(self._share(part), 1.0) * new
         return look * logs
 
@@ -307,13 +311,13 @@ class SegmentSolver:
         """Control steps of the segments' beginnings that are fitted before the whole: ever more through impacts."""
         if not self.windows.impacts:
             return []
-        seen = self.windows.observed[:, 1:].any(0)  # every channel that has samples has one in the shortest beginning
-        first = max(2, 1 + int(seen[:, seen.any(0)].argmax(0).max(initial=0)))
-        return growing_steps(first, int(self.windows.steps.max()), self.tuning.growth)
+        return growing_steps(self.windows.telling_steps(2), int(self.windows.steps.max()), self.tuning.growth)
 
     def _share(self, part: int) -> float:
         """Of the segments that a part holds."""
         windows = self.windows
+        if not windows.has_parts:
+            return math.inf
         columns = windows.num_theta + windows.num_start + 1
         sizes = (*(0.25 for _ in self._beginnings), 0.25, 1.0, self.tuning.whole)
         return float(self.tuning.linearised_steps / columns * sizes[part] / windows.physics_steps)
@@ -354,6 +358,11 @@ class SegmentSolver:
         return None
 
     # Steps
+
+    def _may_screen(self) -> bool:
+        """Whether the budget leaves room for draws from the prior."""
+        share = self._view(0)[1].steps.sum() / self.windows.steps.sum()
+        return self.windows.has_room(math.ceil(_THROUGH_IMPACTS * share) + 1)
 
     def screened(self, nominal: FloatArray, draws: int, number: int = 0) -> tuple[FloatArray, bool]:
         """The best of the nominal model (N,) and draws from the prior, best first; and whether the former is valid.
@@ -430,6 +439,8 @@ class SegmentSolver:
         here, (keep, view) = state.here, self._view(state.here.part)
         with self.windows.counting(view):
             step = self._plain_step(view, here)
+        if not step.lin.valid:  # diverges on what the part before did not hold
+            return replace(state, here=replace(here, stage=Stage.FIT, residual=None, starts_jacobian=None))
         after, more = step.after, self._next_part(Stage.PLAIN, here.part)
         enough = self.tuning.plain_gain * view.num_theta * (10.0 if here.part == 0 and more else 1.0)
         if not step.ends(enough) and after.iteration < self.tuning.most_steps:
@@ -495,7 +506,9 @@ class SegmentSolver:
             still = np.zeros((*lin.residual.shape, view.num_start))
             lin = replace(lin, jacobian=np.concatenate([lin.jacobian, still], axis=-1))
             at = replace(state.here, noise=here.noise, iteration=here.iteration)
-            state = replace(state, optima=(self._optimum(state, at, lin, view.moments(lin, True), keep, view, False),))
+            state = replace(
+                state, optima=(self._optimum(state, at, lin, view.moments(lin, True), keep, view, False, True),)
+            )
             if here.residual is not None and len(wild := wild_residuals(view, here.residual)):
                 state = replace(state, wild=np.concatenate([state.wild, wild]))
                 here = replace(here, residual=None)
@@ -557,7 +570,7 @@ class SegmentSolver:
             if part is not None and state.elsewhere and self._is_behind(state, after, keep, view):
                 return replace(state, optima=tuple(one for one in state.optima if one.finding is None), done=True)
             if part is not None:
-                state = self._recorded(state, self._optimum(state, after, lin, moments, keep, view, False))
+                state = self._recorded(state, self._optimum(state, after, lin, moments, keep, view, False, True))
                 return replace(state, here=replace(after, part=part, residual=None, starts_jacobian=None))
             return self._ended(state, after, lin, moments, keep, view, settled or stuck)
         foretold = trial.gained > 0.75 * trial.expected
@@ -670,8 +683,9 @@ class SegmentSolver:
         keep: IntArray,
         view: Windows,
         settled: bool,
+        early: bool = False,
     ) -> WindowOptimum:
-        """The normal where a part of the segments was linearised; unless ``settled`` one that says that it is early."""
+        """The normal where a part of the segments was linearised; ``early``: of a stage on the way."""
         if settled and here.white and self.windows.settings.noise != "white":
             view = view.part(np.arange(view.num_windows))
             view.settings, moments = replace(view.settings, noise="sandwich"), view.moments(lin)
@@ -681,10 +695,11 @@ class SegmentSolver:
         reason = None
         if not settled:
             steps, whole = here.iteration, here.iteration >= self.tuning.most_steps
-            reason = finding(Code.SEARCH_UNSETTLED, steps=steps) if whole else finding(Code.SEARCH_CUT_SHORT)
-        elif (times := beyond_known_noise(self.windows, optimum.sd, lin.residual)) is not None:
+            cut_short = not whole and (early or self._leaves_no_room())
+            reason = finding(Code.SEARCH_CUT_SHORT) if cut_short else finding(Code.SEARCH_UNSETTLED, steps=steps)
+        elif (times := beyond_known_noise(view, optimum.sd, lin.residual)) is not None:
             reason = finding(Code.BEYOND_START_NOISE, times=times)
-        return replace(optimum, starts=here.starts, slope=slope, finding=reason)
+        return replace(optimum, starts=here.starts, slope=slope, finding=reason, early=early)
 
     def _ended(
         self,
@@ -705,11 +720,11 @@ class SegmentSolver:
         if np.isfinite(state.ends).any():
             state, here = self._from_end(state, int(np.argmin(state.ends)))
             return replace(state, here=here)
-        if state.ends and state.rounds < 2:
+        if state.ends and state.rounds < 2 and self._may_screen():
             points = self.screened(optimum.theta, _THROUGH_IMPACTS, state.rounds + 1)[0]
             again = replace(state, points=points, point=0, ends=(), reached=(), rounds=state.rounds + 1)
             return replace(again, here=self._begin(points[0]))
-        if self._is_poor(optimum) and not state.scouted and self.problem.options.restarts > 1:
+        if not self._beginnings and self._is_poor(optimum) and not state.scouted and self.problem.options.restarts > 1:
             return self._further(state)
         if state.point + 1 < len(state.points):
             point = state.point + 1
@@ -720,9 +735,10 @@ class SegmentSolver:
 
     def _recorded(self, state: SolverState, optimum: WindowOptimum) -> SolverState:
         """With an optimum in the place of what was recorded on the way to it."""
-        early = [k for k, one in enumerate(state.optima) if one.finding is not None]
-        kept = state.optima[: early[-1]] if early and early[-1] == len(state.optima) - 1 else state.optima
-        return replace(state, optima=(*kept, optimum))
+        ends = tuple(one for one in state.optima if not one.early)
+        if optimum.early and ends:
+            return state  # fewer samples do not compare
+        return replace(state, optima=(*ends, optimum))
 
     def _is_poor(self, optimum: WindowOptimum) -> bool:
         """Whether residuals are far larger than what samples scatter by, and a good part of what channels do."""
@@ -740,6 +756,7 @@ class SegmentSolver:
             with self.windows.counting(view):
                 residual, valid = view.residuals(drawn, view.no_starts(len(drawn)))
         except BudgetExhausted:
+            self.windows.short = True
             return replace(state, scouted=True, done=True)
         loss = np.array([self._profile(view, r) if ok else np.inf for r, ok in zip(residual, valid, strict=True)])
         away = np.linalg.norm(drawn - state.optima[-1].theta, axis=1)
@@ -762,11 +779,11 @@ class SegmentSolver:
         state = replace(state, freed=not behind, behind=error / plain if behind else 0.0)
         if not behind:
             return self._finish(state)
-        early = tuple(replace(one, finding=finding(Code.SEARCH_CUT_SHORT)) for one in state.optima)
+        early = replace(best, finding=finding(Code.SEARCH_CUT_SHORT), early=True)
         self.problem.tell("white noise, from the plain fit", self.windows.rollouts)
         part = self._last(Stage.PLAIN)
         here = replace(self._begin(state.plain), stage=Stage.FIT, part=part, white=True)
-        return replace(state, optima=early[-1:], here=here)
+        return replace(state, optima=(early,), here=here)
 
     def free_run_errors(self, theta: FloatArray, plain: FloatArray) -> tuple[float, float]:
         """Free-run errors of theta (N,) and of ``plain`` (N,): geometric means over logs and channels.
@@ -813,7 +830,7 @@ class SegmentSolver:
         try:
             theta = self._find_elsewhere(state)
         except BudgetExhausted:
-            theta = None
+            windows.short, theta = True, None
         if theta is None:
             return replace(state, done=True)
         here = replace(self._begin(theta), stage=Stage.FIT, white=state.here.white)
