@@ -182,7 +182,7 @@ class Code(Enum):
     )
     IMPACTS = blocking(
         "Bodies strike or slip within the segments of these logs, so the likelihood of segments has many optima. "
-        "Use likelihood = 'state_space'"
+        "Use likelihood = 'state_space', in Python sipe.StateSpace()"
     )
     BEYOND_START_NOISE = blocking(
         "The residuals are {times:.1f} times the known measurement noise: the search ended at a wrong optimum, or the "
