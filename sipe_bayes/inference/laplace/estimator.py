@@ -33,6 +33,7 @@ from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarge
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, StateSpace
+from sipe_bayes.likelihood.starts.estimates import contacts_of
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import GaussianMixture
@@ -213,11 +214,11 @@ class Laplace(Estimator[LaplaceState]):
     def _may_lead(self, chain: Chain, search: WindowState | StateSpaceState | KnownStartState) -> bool:
         """Whether a finished search may go on from where segments lead: once, where not every state is measured.
 
-        Not through impacts, which segments do not follow.
+        Not where bodies strike, which segments do not follow.
         """
         if not isinstance(search, StateSpaceState) or search.led or chain.determined.all():
             return False
-        return not any(isinstance(one, ChainOptimum) and one.rough for one in search.optima)
+        return not contacts_of(chain.simulator, [replace(log, states=None) for log in chain.trajectories]).change
 
     def _lost(self, chain: Chain, optimum: Optimum, search: WindowState | StateSpaceState | KnownStartState) -> bool:
         """Whether process noise explains much of a log of which not every state is told: segments may need less."""
