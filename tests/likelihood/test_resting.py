@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.internal.resting import loose_joints, resting_joints
@@ -172,11 +173,22 @@ def test_wheels_that_slip_make_simulations_jump_and_wheels_that_roll_do_not() ->
     assert not Contacts(touch=True, change=True, rough=True).slips
 
 
-def test_a_rovers_motors_come_back_or_are_blocked() -> None:
-    """Tyres slip: two searches end apart, which ``starts_contradict`` tells."""
+@pytest.fixture(scope="module")
+def slipping() -> tuple[FloatArray, Laplace]:
+    """How far off the rover's values are (2,), of their ranges, and the fit."""
     simulator, log = rover()
     estimator = Laplace(simulator, restarts=1, candidates=0, seed=0)
     posterior = estimator.fit(log)
     off = np.abs(posterior.mean.numpy() - simulator.space.normalise(np.array([0.5, 0.03])))
     print(off, posterior.stddev.numpy(), [f.code.name for f in estimator.findings], estimator.rollouts)
-    assert (off < 0.03).all() or estimator.findings.blocking  # it began 0.3 off
+    return off, estimator
+
+
+@pytest.mark.xfail(reason="where tyres slip, the state space ends far from the dry friction", strict=True)
+def test_a_rovers_motors_come_back(slipping: tuple[FloatArray, Laplace]) -> None:
+    assert (slipping[0] < 0.03).all()  # it began 0.3 off
+
+
+def test_a_rover_that_does_not_come_back_is_blocked(slipping: tuple[FloatArray, Laplace]) -> None:
+    """Two searches end apart, which ``starts_contradict`` tells."""
+    assert slipping[1].findings.blocking
