@@ -36,11 +36,6 @@ class Contacts:
     change: bool = False
     rough: bool = False
 
-    @property
-    def slips(self) -> bool:
-        """Whether simulations jump though nothing is struck: what touches all along slips."""
-        return self.rough and not self.change
-
 
 def contacts_along(
     simulator: Simulator | CallableSimulator, logs: Sequence[FloatArray], sampled: Sequence[FloatArray] | None = None
