@@ -15,7 +15,7 @@ from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.diagnostics.records import LogReport
-from sipe_bayes.likelihood.wild_samples import WILD, jumps
+from sipe_bayes.likelihood.wild_samples import AFTER, jumps
 
 _EVEN, _FEWEST = 0.95, 10  # share of a slower sensor's samples that are as far apart as usual; and how many it has
 _ROUNDED = 1e-6  # of a period: less is how times near zero are rounded
@@ -121,7 +121,7 @@ def _commanded(raw: Recording, times: FloatArray, places: IntArray) -> BoolArray
         return np.zeros(0, bool)
     jumped = [y.time[1 + jumps(y.values)] for y in raw.commands if np.isfinite(y.values).all()]
     ago = times[places + 1, None] - np.concatenate([*jumped, np.full(1, np.inf)])
-    return np.asarray(((ago >= 0) & (ago <= WILD.after * float(np.median(np.diff(times))))).any(axis=1))
+    return np.asarray(((ago >= 0) & (ago <= AFTER * float(np.median(np.diff(times))))).any(axis=1))
 
 
 def _every(known: BoolArray) -> int:
