@@ -1,8 +1,8 @@
-"""Noise of the residuals of windows: white or coloured, how residuals are whitened; how noisy samples are beforehand.
+"""Noise of residuals: white or coloured, how residuals are whitened; how noisy samples are beforehand.
 
-Residual model, per channel c and along each log: e_j = a_j e_{j-1} + sqrt(1 - a_j^2) sigma_c z_j, z_j ~ N(0, 1), with
-a_j = exp(-gap_j / tau_c) for the time since the previous sample there is (first-order autoregression, which carries
-on across windows and across missing samples); e_0 ~ N(0, sigma_c^2). White noise is tau = 0.
+Per channel c and along each log, e_j = a_j e_{j-1} + sqrt(1 - a_j^2) sigma_c z_j with z_j ~ N(0, 1) and
+a_j = exp(-gap_j / tau_c) for the time since the previous sample. This first-order autoregression carries on across
+windows and missing samples; e_0 ~ N(0, sigma_c^2). White noise is tau = 0.
 """
 
 from __future__ import annotations
@@ -19,14 +19,11 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.sequences import Sequence
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.likelihood.starts.estimates import are_states
-from sipe_bayes.likelihood.starts.smoothing import left_by_smoothing, smoothed
+from sipe_bayes.likelihood.starts.smoothing import filled, left_by_smoothing, smoothed
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
 NORMAL_MAD = 1.4826  # sd of a normal over the median of its absolute values
-_ROUNDING = 1e-6  # of the largest sample: trajectories are kept in single precision at places
-_ENOUGH = 10  # differences of a channel, which tell their sd to a quarter
-_FALSE_ALARM = 1e-3  # with which roughness is corrected by fewer
 
 
 def coefficients(gaps: FloatArray, tau: float | FloatArray) -> FloatArray:
@@ -82,29 +79,28 @@ def whiten(residual: FloatArray, sequence: Sequence, sd: float, tau: float) -> F
 def noise_level(
     trajectories: Trajectories, likelihood: Segments | StateSpace, simulator: Simulator | CallableSimulator
 ) -> FloatArray:
-    """Sd (O,) of each channel's noise in its unit.
+    """Sd (O,) of each channel's noise in its unit: the first of these that there is.
 
-    As ``likelihood.noise_sd`` states it. Else, where ten states or all of them are recorded, the root mean square of
-    what samples differ from what these show; channels that they do not show, or whose sensor is unknown, have none
-    where nothing differs. Else the robust sd of what local quadratics over 60 ms leave of the samples, scaled where
-    fewer states do not fit that. It takes contact, where a channel jumps from sample to sample, for noise.
+    1. As ``likelihood.noise_sd`` states it.
+    2. Where ten states, or all, are recorded: the root mean square of what samples differ from what these show.
+       Channels that they do not show have none where nothing differs.
+    3. The robust sd of what local quadratics over 60 ms leave of the samples, scaled where fewer states do not fit
+       that. It takes contact, where a channel jumps from sample to sample, for noise.
 
     States count as exact: where they are measurements, from which the channels were made, nothing tells their noise.
 
     Raises:
         ValueError: where the settings state another number of sds than there are channels.
     """
-    count = trajectories.observations.shape[2]
-    stated = likelihood.noise_sd or (None,) * count
-    if len(stated) != count:
-        raise ValueError(f"noise_sd: expected {count} values, one for each channel, got {len(stated)}")
-    if all(sd is not None for sd in stated):
-        return np.array(stated, float)
+    channels = list(range(trajectories.observations.shape[2]))
+    stated = chosen_sd(likelihood.noise_sd, channels, simulator.environment.channels)
+    if not np.isnan(stated).any():
+        return stated
     estimated, states = _roughness(trajectories), trajectories.states
     if states is not None and isinstance(simulator, Simulator) and are_states(simulator, states):
-        off, sensed = _differences(trajectories, states, simulator), bool(simulator.environment.sensed)
-        estimated = _beside_states(off, trajectories, estimated, sensed)
-    return np.array([estimated[c] if sd is None else sd for c, sd in enumerate(stated)])
+        off = _differences(trajectories, states, simulator)
+        estimated = _beside_states(off, trajectories, estimated, bool(simulator.environment.sensed))
+    return np.where(np.isnan(stated), estimated, stated)
 
 
 def states_throughout(trajectories: Trajectories) -> bool:
@@ -124,8 +120,7 @@ def _differences(trajectories: Trajectories, states: FloatArray, simulator: Simu
             shown[..., channel] = states[..., column]
     shown[..., list(environment.sensed)] = np.nan
     off = seen - shown
-    for triple in environment.rotations:
-        channels = list(triple)
+    for channels in map(list, environment.rotations):
         off[..., channels] = between(seen[..., channels], shown[..., channels])
     return off
 
@@ -134,8 +129,9 @@ def _beside_states(off: FloatArray, trajectories: Trajectories, rough: FloatArra
     """Sd (O,) by differences (R, T+1, O) and roughness (O,); whether something of a sensor is unknown."""
     seen = trajectories.observations
     largest = np.abs(np.where(np.isfinite(seen), seen, 0.0)).max((0, 1))
-    known, differs = np.isfinite(off).sum((0, 1)), (np.abs(off) > _ROUNDING * largest).any((0, 1))
-    enough = (known >= _ENOUGH) | ((known > 0) & states_throughout(trajectories))
+    known = np.isfinite(off).sum((0, 1))
+    differs = (np.abs(off) > 1e-6 * largest).any((0, 1))  # trajectories are kept in single precision at places
+    enough = (known >= 10) | ((known > 0) & states_throughout(trajectories))  # ten tell their sd to a quarter
     unshown = not known.any() and not sensed and states_throughout(trajectories)
     if not differs.any() and (enough.any() or unshown):
         return np.zeros(len(known))  # what the states do not show is as exact as what they do
@@ -146,9 +142,8 @@ def _beside_states(off: FloatArray, trajectories: Trajectories, rough: FloatArra
 def _corrected(off: FloatArray, few: BoolArray, rough: FloatArray) -> FloatArray:
     """Roughness (O,), of ``few`` scaled where their differences together do not fit it: slow noise is smooth."""
     few = few & (rough > 0)
-    seen = np.isfinite(off[..., few])
-    total, count = float(np.nansum((off[..., few] / rough[few]) ** 2)), int(seen.sum())
-    if not count or min(chi2.cdf(total, count), chi2.sf(total, count)) > _FALSE_ALARM / 2:
+    total, count = float(np.nansum((off[..., few] / rough[few]) ** 2)), int(np.isfinite(off[..., few]).sum())
+    if not count or min(chi2.cdf(total, count), chi2.sf(total, count)) > 5e-4:
         return rough
     return np.where(few, rough * np.sqrt(total / count), rough)
 
@@ -157,14 +152,10 @@ def _roughness(trajectories: Trajectories) -> FloatArray:
     """Robust sd (O,) of what smoothing leaves; zero of what was not measured, or of fewer than five samples."""
     left = []
     for trajectory in trajectories:
-        series = trajectory.observations
-        finite, filled = np.isfinite(series), np.zeros(series.shape)
-        for c, seen in enumerate(finite.T):
-            if seen.any():
-                filled[:, c] = np.interp(np.arange(len(series)), np.flatnonzero(seen), series[seen, c])
-        share = left_by_smoothing(len(series), trajectory.dt)
+        series, share = trajectory.observations, left_by_smoothing(len(trajectory) + 1, trajectory.dt)
         if share > 0:
-            left.append(np.where(finite, filled - smoothed(filled, trajectory.dt), np.nan) / np.sqrt(share))
+            known = filled(series)
+            left.append(np.where(np.isfinite(series), known - smoothed(known, trajectory.dt), np.nan) / np.sqrt(share))
     sd = np.zeros(trajectories.observations.shape[2])
     for c, rest in enumerate(np.concatenate(left).T if left else ()):
         if np.isfinite(rest).any():

@@ -20,7 +20,7 @@ from sipe_bayes.envs.internal.closed_chains import SD, close, dependent_joints, 
 from sipe_bayes.envs.internal.resting import loose_joints, rest
 from sipe_bayes.envs.internal.states import activations_at_rest, joints_at_rest, own_filters, settle
 from sipe_bayes.envs.poses import PoseReading, has_pose, inertial_joints, is_round
-from sipe_bayes.likelihood.starts.smoothing import smoothed, smoothed_rotations
+from sipe_bayes.likelihood.starts.smoothing import filled, smoothed, smoothed_rotations
 from sipe_bayes.likelihood.state_space.indirect_positions import LogSamples, indirect_positions
 from sipe_bayes.likelihood.state_space.inertial import carried, orientations
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
@@ -36,11 +36,10 @@ def estimate_states(
 ) -> FloatArray:
     """A first guess of the states (T+1, S) along a log: recorded ones of such a model, else measured ones.
 
-    Measured coordinates are smoothed by local quadratics over 60 ms, missing samples bridged, unmeasured velocities
-    the slopes of the positions. Orientations are smoothed likewise, in rotation vectors from each sample; the joint's
-    body is where the measured frame tells. Positions that channels tell without measuring them are where these fit best
-    (``indirect_positions``), joints of closed chains follow, and what contact holds rests on it. What no channel tells
-    stays at the model's reset state. The search starts here, and so do the windows of held-out logs.
+    Measured coordinates are smoothed by local quadratics over 60 ms, with missing samples on lines. Unmeasured
+    velocities are the slopes of the positions. Orientations are smoothed in rotation vectors from each sample.
+    Positions that channels tell without measuring them are where these fit best (``indirect_positions``), joints of
+    closed chains follow, and what contact holds rests on it. What no channel tells stays at the model's reset state.
 
     Args:
         simulator: of the model.
@@ -56,15 +55,11 @@ def estimate_states(
 def _estimated(
     simulator: Simulator, trajectory: Trajectory, raw: bool, rows: IntArray | None = None
 ) -> tuple[FloatArray, set[int], Followed]:
-    """States (T+1, S) along a log; and ids of the joints that channels tell indirectly, and those that follow."""
+    """States (T+1, S) along a log; ids of the joints that channels tell indirectly, and those that follow others."""
     model, states = simulator.model, np.tile(simulator.default_state(), (len(trajectory) + 1, 1))
     columns = simulator.environment.state_columns(model)
-    measured: dict[int, FloatArray] = {}
-    for channel, column in enumerate(columns):
-        series = trajectory.observations[:, channel]
-        finite = np.flatnonzero(np.isfinite(series))
-        if column is not None and len(finite):
-            measured[column] = np.interp(np.arange(len(series)), finite, series[finite])
+    known_samples, seen = filled(trajectory.observations), np.asarray(np.isfinite(trajectory.observations).any(0))
+    measured = {column: known_samples[:, c] for c, column in enumerate(columns) if column is not None and seen[c]}
     for position, velocity in velocity_columns(model).items():
         if position in measured and velocity not in measured:
             states[:, velocity] = smoothed(measured[position], trajectory.dt, 1)
@@ -77,7 +72,7 @@ def _estimated(
         _put_pose(model, {r.quantity: r for r in readings_of}, trajectory, states, raw)
     for joint in inertial_joints(model, readings):
         _put_felt(simulator, {r.quantity: r for r in readings if r.joint == joint}, trajectory, states)
-    known = measured_joints(simulator, np.asarray(np.isfinite(trajectory.observations).any(0)))
+    known = measured_joints(simulator, seen)
     indirect = _put_indirect(simulator, trajectory, states, known, measured, raw)
     if rows is None or not len(rows) or may_touch(model):  # what rests is looked for along the log
         rows = np.arange(len(states))
@@ -88,15 +83,9 @@ def _estimated(
     unknown = set(range(model.njnt)) - known - indirect - set(follow)
     if unknown and may_touch(model) and not simulator.environment.stepwise:
         rates = [column for column in measured if column > model.nq]
-        seen = states[:, rates].copy()
-        follow |= rest(
-            model,
-            states,
-            trajectory.dt,
-            loose_joints(model, unknown),
-            functools.partial(_simulated, simulator, trajectory),
-        )
-        states[:, rates] = seen
+        kept, simulated = states[:, rates].copy(), functools.partial(_simulated, simulator, trajectory)
+        follow |= rest(model, states, trajectory.dt, loose_joints(model, unknown), simulated)
+        states[:, rates] = kept
     return states, indirect, follow
 
 
@@ -123,12 +112,11 @@ def _put_indirect(
 
     measured: columns of the states.
     """
-    model, columns = simulator.model, simulator.environment.state_columns(simulator.model)
-    derived = [c is None for c in columns]
+    model, samples = simulator.model, LogSamples(simulator, trajectory)
+    derived = [c is None for c in simulator.environment.state_columns(model)]
     hidden = [j for j in range(model.njnt) if j not in known and not has_pose(model, j)]
-    samples = LogSamples(simulator, trajectory)
-    tell = samples.observed[:, derived].any()
-    if not hidden or not tell or simulator.environment.memory_size or len(trajectory) < 2:
+    tell = samples.observed[:, derived].any() and len(trajectory) > 1
+    if not hidden or not tell or simulator.environment.memory_size:
         return set()
     direct = np.isin(
         np.arange(2 * model.nv + model.na), [c - 1 - model.nq + model.nv for c in measured if c > model.nq]
@@ -217,12 +205,8 @@ def _put_felt(
 
 
 def _values(trajectory: Trajectory, reading: PoseReading, raw: bool) -> FloatArray:
-    """The three channels (T+1, 3), missing samples bridged, smoothed unless ``raw``."""
-    columns = []
-    for series in trajectory.observations[:, reading.channels].T:
-        finite = np.flatnonzero(np.isfinite(series))
-        columns.append(np.interp(np.arange(len(series)), finite, series[finite]))
-    values = np.stack(columns, axis=1)
+    """The three channels (T+1, 3), missing samples on lines, smoothed unless ``raw``."""
+    values = filled(trajectory.observations[:, reading.channels])
     return values if raw else smoothed(values, trajectory.dt)
 
 
@@ -291,10 +275,8 @@ def all_starts_measured(simulator: Simulator, trajectories: Trajectories) -> boo
 def _followed(simulator: Simulator, trajectories: Trajectories) -> Followed:
     """The joints that nothing measures and that follow measured ones in every log, with their largest sds."""
     touch = may_touch(simulator.model) and not are_states(simulator, trajectories.states)
-    if (
-        not (simulator.model.neq or touch)
-        or len(measured_joints(simulator, _seen_in(trajectories))) == simulator.model.njnt
-    ):
+    measured = len(measured_joints(simulator, _seen_in(trajectories)))
+    if not (simulator.model.neq or touch) or measured == simulator.model.njnt:
         return {}
     logs = [follow for _, follow in _inferred(simulator, trajectories)]
     sds = {j: np.max([own[j] for own in logs], axis=0) for j in set.intersection(*(set(own) for own in logs))}

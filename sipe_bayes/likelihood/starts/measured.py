@@ -11,7 +11,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.sensing import Sensing, delayed
 from sipe_bayes.likelihood.starts.estimates import are_states, estimate_states, velocity_columns
-from sipe_bayes.likelihood.starts.smoothing import smoothed
+from sipe_bayes.likelihood.starts.smoothing import filled, smoothed
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import tangents
 
@@ -74,8 +74,9 @@ class MeasuredStarts:
         key = number, late.tobytes()
         if key not in self._earlier:
             log = self.trajectories[number]
-            bridged = np.stack([_bridged(column) for column in log.observations.T], axis=-1)
-            moved = delayed(bridged[None], -late[None, None] / log.dt, self.simulator.environment.rotations)[0]
+            moved = delayed(
+                filled(log.observations)[None], -late[None, None] / log.dt, self.simulator.environment.rotations
+            )[0]
             known = np.where(np.isfinite(log.observations).any(0), moved, np.nan)
             if len(self._earlier) >= 256:  # a search asks for a few at a time
                 self._earlier.clear()
@@ -84,12 +85,10 @@ class MeasuredStarts:
 
 
 def measurement_sd(simulator: Simulator, trajectories: Trajectories) -> tuple[FloatArray, BoolArray]:
-    """Sd (2 nv + na,) with which smoothed measurements tell positions and velocities, and which are slopes of others.
+    """Sd (2 nv + na,) with which smoothed measurements tell coordinates, and which are slopes of others.
 
-    It is infinite where nothing measures a coordinate.
-
-    What local quadratics over twice as many samples differ from the usual ones, root mean square, times 3: that holds
-    noise and what smoothing bends, and is safe at the ends of a log, where a quadratic is least sure.
+    Three times the root mean square by which local quadratics over twice as many samples differ from the usual ones:
+    that holds noise and what smoothing bends, also at the ends of a log. Infinite where nothing measures a coordinate.
     """
     model = simulator.model
     states, tangent = simulator.environment.state_columns(model), tangent_columns(model)
@@ -98,7 +97,7 @@ def measurement_sd(simulator: Simulator, trajectories: Trajectories) -> tuple[Fl
     rates = velocity_columns(model)
     measured = {column: c for c, column in enumerate(states) if column in tangent}
     for log in trajectories if len(measured) else ():
-        series = np.stack([_bridged(column) for column in log.observations.T], axis=-1)
+        series = filled(log.observations)
         if len(series) < 10:
             continue
         for column, channel in measured.items():
@@ -122,12 +121,6 @@ def _quantum(series: FloatArray) -> float:
     """The smallest step between two samples (T+1,): the resolution of an encoder."""
     steps = np.abs(np.diff(series))
     return float(steps[steps > 0].min()) if (steps > 0).any() else 0.0
-
-
-def _bridged(series: FloatArray) -> FloatArray:
-    """A channel (T+1,) whose missing samples lie on lines; zeros without any."""
-    seen = np.flatnonzero(np.isfinite(series))
-    return np.interp(np.arange(len(series)), seen, series[seen]) if len(seen) else np.zeros(len(series))
 
 
 def tangent_columns(model: mujoco.MjModel) -> dict[int, int]:

@@ -1,10 +1,13 @@
-"""Local quadratics over the samples of a log: what is smooth in them, and its slopes."""
+"""Local quadratics over the samples of a log: what is smooth in them, and its slopes.
+
+A. Savitzky, M. Golay 1964, "Smoothing and differentiation of data by simplified least squares procedures", Anal. Chem.
+36; SciPy's.
+"""
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
+from scipy.signal import savgol_coeffs, savgol_filter
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.rotations import added, between
@@ -22,36 +25,23 @@ def smoothed(series: FloatArray, dt: float, derivative: int = 0, wider: int = 1)
     span = _span(len(series), dt, wider)
     if span < 3:
         return np.gradient(series, dt, axis=0) if derivative else series
-    weights, columns, half = _weights(span, derivative), series.reshape(len(series), -1), span // 2
-    inner = [np.convolve(column, weights[half, ::-1], "valid") for column in columns.T]
-    ends = weights[:half] @ columns[:span], weights[half + 1 :] @ columns[-span:]
-    smooth = np.concatenate([ends[0], np.stack(inner, axis=1), ends[1]])
-    return np.asarray(smooth.reshape(series.shape) / dt**derivative)
+    return np.asarray(savgol_filter(series, span, 2, derivative, delta=dt, axis=0))
+
+
+def filled(series: FloatArray) -> FloatArray:
+    """Series (T+1,) or (T+1, C) whose missing samples lie on lines; zeros where there is no sample at all."""
+    out, place = np.zeros(series.shape), np.arange(len(series))
+    for column, values in zip(out.reshape(len(out), -1).T, series.reshape(len(out), -1).T, strict=True):
+        seen = np.flatnonzero(np.isfinite(values))
+        if len(seen):
+            column[:] = np.interp(place, seen, values[seen])
+    return out
 
 
 def left_by_smoothing(count: int, dt: float) -> float:
     """Share of white noise's variance in samples less ``smoothed``, away from their ends; 0 of fewer than five."""
     span = _span(count, dt)
-    return 0.0 if span < 5 else float(1 - _weights(span, 0)[span // 2, span // 2])
-
-
-def _span(count: int, dt: float, wider: int = 1) -> int:
-    """Samples of a local quadratic, an odd number."""
-    half = wider * (max(5, 2 * round(0.06 / dt / 2) + 1) // 2)
-    return min(2 * half + 1, count - (count + 1) % 2)
-
-
-@functools.lru_cache(maxsize=64)
-def _weights(span: int, derivative: int) -> FloatArray:
-    """Weights (span, span) of a local quadratic's samples, for its value or slope per sample at each of them.
-
-    A. Savitzky, M. Golay 1964, "Smoothing and differentiation of data by simplified least squares procedures",
-    Anal. Chem. 36.
-    """
-    place = np.arange(span) - span // 2
-    powers = np.stack([np.ones(span), place, place**2], axis=1)
-    wanted = np.stack([np.zeros(span), np.ones(span), 2.0 * place], axis=1) if derivative else powers
-    return np.asarray(wanted @ np.linalg.pinv(powers))
+    return 0.0 if span < 5 else float(1 - savgol_coeffs(span, 2)[span // 2])
 
 
 def smoothed_rotations(vectors: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
@@ -64,8 +54,15 @@ def smoothed_rotations(vectors: FloatArray, dt: float) -> tuple[FloatArray, Floa
         turn = between(vectors[1:], vectors[:-1]) / dt if count > 1 else np.zeros((1, 3))
         return vectors, np.concatenate([turn, turn[-1:]])[:count]
     begin = np.clip(np.arange(count) - span // 2, 0, count - span)
-    neighbours = begin[:, None] + np.arange(span)
-    ways = between(vectors[neighbours], vectors[:, None])
-    place = np.arange(count) - begin
-    smooth, slope = ((_weights(span, derivative)[place][..., None] * ways).sum(1) for derivative in (0, 1))
-    return added(vectors, smooth), slope / dt
+    ways, place = between(vectors[begin[:, None] + np.arange(span)], vectors[:, None]), np.arange(count) - begin
+    smooth, slope = (
+        np.stack([savgol_coeffs(span, 2, derivative, dt, at, "dot") for at in range(span)])[place]
+        for derivative in (0, 1)
+    )
+    return added(vectors, np.einsum("ks,ksi->ki", smooth, ways)), np.einsum("ks,ksi->ki", slope, ways)
+
+
+def _span(count: int, dt: float, wider: int = 1) -> int:
+    """Samples of a local quadratic, an odd number."""
+    half = wider * (max(5, 2 * round(0.06 / dt / 2) + 1) // 2)
+    return min(2 * half + 1, count - (count + 1) % 2)
