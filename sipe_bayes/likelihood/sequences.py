@@ -9,10 +9,6 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 
-_BLOCK, _LEAST_WINDOWS = 4, 2  # windows that stay together where not all are kept; of a log
-_LEFT_OUT = 8  # one in so many of a log's samples
-_SAME_RATE = 1e-3  # relative: logs of one machine whose clocks differ by less have gaps of one length
-
 
 @dataclass(frozen=True)
 class Sequence:
@@ -62,17 +58,15 @@ def sequences(observed: BoolArray, sample: IntArray, log: IntArray, dt: FloatArr
 
 
 def spread_blocks(log: IntArray, share: float) -> IntArray:
-    """Numbers of the windows that are kept of each log: blocks of a few, spread evenly over it.
+    """Numbers of the windows that are kept of logs (W,): blocks of four, spread evenly over each log.
 
-    Args:
-        log: (W,), of which each window is.
-        share: of the windows, all from 1 on; at least two windows of each log are kept.
+    share: of the windows, all from 1 on; at least two windows of each log are kept.
     """
     kept = []
     for number in np.unique(log):
         own = np.flatnonzero(log == number)
-        count = min(len(own), max(_LEAST_WINDOWS, round(share * len(own))))
-        blocks = np.array_split(own, math.ceil(count / _BLOCK))
+        count = min(len(own), max(2, round(share * len(own))))
+        blocks = np.array_split(own, math.ceil(count / 4))
         sizes = [len(x) for x in np.array_split(np.arange(count), len(blocks))]
         for block, size in zip(blocks, sizes, strict=True):
             first = (len(block) - size) // 2
@@ -81,11 +75,11 @@ def spread_blocks(log: IntArray, share: float) -> IntArray:
 
 
 def _rates(dt: FloatArray) -> FloatArray:
-    """Seconds per sample (W,), those alike as the shortest of them: each length of a gap costs products of its own."""
+    """Seconds per sample (W,), those alike to .1 % as the shortest of them: each length of a gap costs products."""
     alike = dt.copy()
     while (left := alike > 0).any():
         shortest = alike[left].min()
-        alike[left & (alike <= shortest * (1 + _SAME_RATE))] = -shortest
+        alike[left & (alike <= shortest * (1 + 1e-3))] = -shortest
     return -alike
 
 
@@ -101,12 +95,10 @@ def _blocks(log: IntArray, start: IntArray, stride: IntArray) -> tuple[IntArray,
 def reached(
     remembers: FloatArray, late: FloatArray, dt: FloatArray, log: IntArray, start: IntArray, stride: IntArray
 ) -> tuple[IntArray, IntArray, IntArray]:
-    """How many samples (W, C) after its start a window's predictions begin that tell of it alone, and where they do.
+    """How many samples (W, C) after its start a window's predictions tell of it alone, and where they begin (W, C).
 
-    And the control steps (W,) to the end of the log or block.
-
-    The second differs where a log begins, or a block of one that is kept in part: no window predicts what tells of the
-    time before, an eighth of the log or block at most.
+    And the control steps (W,) to the end of the log or block. The second differs where a log begins, or a block of one
+    that is kept in part: no window predicts what tells of the time before, an eighth of the log or block at most.
 
     Args:
         remembers: (C,) seconds in which a channel tells of what was before; half a block's at most.
@@ -123,36 +115,22 @@ def reached(
         for x in (remembers, np.maximum(remembers, late))
     )
     into = (start - first)[:, None]
-    left_out = np.minimum(out, length[:, None] // _LEFT_OUT) - into
+    left_out = np.minimum(out, length[:, None] // 8) - into
     return lead, np.maximum(left_out, np.where(into, lead, 0)), past - start
-
-
-def owned_samples(place: IntArray, stride: IntArray, left: IntArray, known: bool) -> BoolArray:
-    """Whether a sample (W, L) is the window's: of each log every sample is of one.
-
-    Args:
-        place: (L,), in the window.
-        stride: (W,), control steps to the beginning of the next window.
-        left: (W,), to the end of the log or block.
-        known: whether starts are, so that the samples after them are what a window predicts.
-    """
-    if known:
-        return np.asarray((place >= 1) & (place <= stride[:, None]))
-    return np.asarray(place < (stride + (stride == left))[:, None])
 
 
 def compared_samples(
     place: IntArray, stride: IntArray, left: IntArray, begin: IntArray, lead: IntArray, known: bool
 ) -> BoolArray:
-    """Whether a window predicts a channel's sample (W, L, C): those ``lead`` later than ``owned_samples``.
+    """Whether a window predicts a channel's sample (W, L, C); of zeros ``begin`` and ``lead`` each sample is of one.
 
     Args:
         place: (L,), in the window.
         stride: (W,), control steps to the beginning of the next window.
         left: (W,), to the end of the log or block.
         begin: (W, C), the first that it predicts.
-        lead: (W, C), see ``reached``.
-        known: whether starts are.
+        lead: (W, C), samples that predictions come later, see ``reached``.
+        known: whether starts are, so that the samples after them are what a window predicts.
     """
     end, begin = (stride[:, None] + lead)[:, None], begin[:, None]
     place, inside = place[None, :, None], (place <= left[:, None])[..., None]

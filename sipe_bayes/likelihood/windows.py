@@ -30,7 +30,7 @@ from sipe_bayes.core.rotations import nearest, written_near
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_level, noise_scales, pooled, whiten
-from sipe_bayes.likelihood.sequences import Sequence, compared_samples, owned_samples, reached, sequences, spread_blocks
+from sipe_bayes.likelihood.sequences import Sequence, compared_samples, reached, sequences, spread_blocks
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments, chosen_channels, fitted_rotations
 from sipe_bayes.likelihood.starts.estimates import (
     STATE_STEP,
@@ -40,8 +40,7 @@ from sipe_bayes.likelihood.starts.estimates import (
     estimate_states,
     start_sd,
 )
-from sipe_bayes.likelihood.starts.filters import FilterStarts
-from sipe_bayes.likelihood.starts.history import past_commands, with_history
+from sipe_bayes.likelihood.starts.history import FilterStarts, past_commands, with_history
 from sipe_bayes.likelihood.starts.measured import MeasuredStarts, measurement_sd
 from sipe_bayes.simulation.contacts import Contacts, may_touch
 from sipe_bayes.simulation.prompt import prompt
@@ -134,7 +133,8 @@ class Windows:
         self.steps = np.minimum(self.stride + self.lead.max(1), left)
         place = np.arange(int(self.steps.max()) + 1)
         sample = self.start[:, None] + place
-        self.owned = owned_samples(place, self.stride, left, known)
+        none = np.zeros((len(left), 1), np.int64)
+        self.owned = compared_samples(place, self.stride, left, none, none, known)[..., 0]
         self.compared = compared_samples(place, self.stride, left, self.begin, self.lead, known)
         clipped = np.minimum(sample, trajectories.length[self.log][:, None])
         self.measured = trajectories.observations[self.log[:, None], clipped][:, :, self.channels]
