@@ -1,10 +1,9 @@
 """The cost of a theta: how far what it simulates is from what was recorded.
 
-Recorded trajectories are cut into windows (``likelihood.settings.Segments``), each replayed from its own recorded or
-estimated starting state with the recorded actions. ``Segments(window=None)`` replays whole trajectories, as the SiPE
-paper does (Mehta, Handa, Fox, Ramos 2020, section 2.3). The default, half a second, is a deviation from it: over a
-whole trajectory contact and chaos hide the parameters (half-cheetah, 200 steps: least squares is no better than the
-prior mean).
+Windows (``likelihood.settings.Segments``) are replayed from their recorded or estimated initial states with the
+recorded actions. ``Segments(window=None)`` replays whole trajectories, as the SiPE paper does (Mehta, Handa, Fox, Ramos
+2020, section 2.3). The default, half a second, is a deviation from it: over a whole trajectory contact and chaos hide
+the parameters (half-cheetah, 200 steps: least squares is no better than the prior mean).
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.likelihood.callable_windows import CallableWindows
+from sipe_bayes.likelihood.binding import CallableWindows
 from sipe_bayes.likelihood.windows import Windows
 
 
@@ -45,15 +44,11 @@ def channel_scale(windows: Windows, first: FloatArray) -> FloatArray:
     has no spread: there it is that of the ``first`` simulations (B, W, L, C), and the channel's magnitude where they do
     not differ; NaN where none was valid.
     """
-    if isinstance(windows, CallableWindows):
-        return _simulated_scale(windows, first)
-    seen = [windows.measured[..., c][windows.observed[..., c]] for c in range(len(windows.channels))]
-    spread = np.array([values.std() if len(values) else 0.0 for values in seen])
-    moving = spread[spread > 0]
-    return np.maximum(spread, 1e-3 * float(np.median(moving)) if len(moving) else 1.0)
-
-
-def _simulated_scale(windows: CallableWindows, first: FloatArray) -> FloatArray:
+    if not isinstance(windows, CallableWindows):
+        seen = [windows.measured[..., c][windows.observed[..., c]] for c in range(len(windows.channels))]
+        spread = np.array([values.std() if len(values) else 0.0 for values in seen])
+        moving = spread[spread > 0]
+        return np.maximum(spread, 1e-3 * float(np.median(moving)) if len(moving) else 1.0)
     samples = first[:, :, 1].reshape(-1, first.shape[-1])
     samples = samples[np.isfinite(samples).all(1)]
     if not len(samples):

@@ -1,10 +1,9 @@
 """Replicas of recorded trajectories: the same experiment simulated at a known theta, with the recording's noise.
 
-Commands, sample times, starting states and missing samples are those of the recording; the noise is drawn anew, white
-or first-order autoregressive in each channel, and where the recording has process noise, each state after a control
-step is moved by some. The commands are replayed open loop: where a feedback law kept the machine on its course, a
-replica at another theta leaves it, and what is inferred from replicas holds for short logs or small moves of theta
-only.
+Commands, sample times, initial states and missing samples are those of the recording. The noise is drawn anew, white or
+first-order autoregressive in each channel; process noise moves each state after a control step. The commands are
+replayed open loop: where a feedback law kept the machine on its course, a replica at another theta leaves it. There
+replicas hold for short logs or small moves of theta only.
 """
 
 from __future__ import annotations
@@ -35,11 +34,7 @@ def observation_noise(
     likelihood: Segments | StateSpace,
     simulator: Simulator | CallableSimulator,
 ) -> Noise:
-    """Noise of all O channels.
-
-    As an estimator's ``diagnostics`` say (``noise_sd``, ``noise_tau``) of the channels that it fitted; ``noise_level``
-    tells of the others, as white.
-    """
+    """Noise of all O channels: of those fitted by an estimator's ``diagnostics``, else white by ``noise_level``."""
     sd = noise_level(trajectories, likelihood, simulator)
     tau = np.zeros(len(sd))
     fitted = list(range(len(sd)))
@@ -82,8 +77,8 @@ class Replicas:
         Args:
             theta: (B, N).
             rng: of the noise.
-            estimated: a replica starts where the recording's own start would lie if the replica's noise were what its
-                estimate is off by, so that a recording is as far from its replicas as they are from one another.
+            estimated: whether a replica's noise also moves its start, as noise moved the estimate of the recording's.
+                So a recording is as far from its replicas as they are from one another.
         """
         noises = [self._noise(rng) for _ in theta]
         starts = np.concatenate([self.starts - self._misled(n) for n in noises]) if estimated else self.starts
@@ -143,8 +138,12 @@ class Replicas:
 
     def _noise(self, rng: np.random.Generator) -> FloatArray:
         """Noise (R, T+1, O) of every trajectory."""
-        samples = self.trajectories.observations.shape[1]
-        noise = np.stack([self._drawn(samples, float(dt), rng) for dt in self.trajectories.dt])
+        noise = rng.standard_normal(self.trajectories.observations.shape)
+        for own, dt in zip(noise, self.trajectories.dt, strict=True):
+            for c, (sd, tau) in enumerate(zip(self.noise.sd, self.noise.tau, strict=True)):
+                a = float(np.exp(-dt / tau)) if tau > 0 else 0.0
+                own[1:, c] *= np.sqrt(1 - a**2)
+                own[:, c] = sd * scipy.signal.lfilter([1.0], [1.0, -a], own[:, c])
         if isinstance(self.simulator, CallableSimulator):
             noise[:, 0] = 0.0  # x is the second sample
         return noise
@@ -163,25 +162,14 @@ class Replicas:
 
     @cached_property
     def _beginnings(self) -> list[tuple[Trajectory, FloatArray]]:
-        """The first moments of every recording, and the start that they tell."""
+        """The first .2 s of every recording, more than an estimate depends on, and the start that they tell."""
         assert isinstance(self.simulator, Simulator)
         beginnings = []
         for recorded in self.trajectories:
-            steps = min(len(recorded), max(4, math.ceil(0.2 / recorded.dt)))  # more than the estimate depends on
+            steps = min(len(recorded), max(4, math.ceil(0.2 / recorded.dt)))
             begin = Trajectory(recorded.observations[: steps + 1], recorded.actions[:steps], recorded.dt)
             beginnings.append((begin, estimate_states(self.simulator, begin)[0]))
         return beginnings
-
-    def _drawn(self, count: int, dt: float, rng: np.random.Generator) -> FloatArray:
-        """Noise (count, O) of samples dt seconds apart."""
-        white = rng.standard_normal((count, len(self.noise.sd)))
-        out = np.empty_like(white)
-        for c, (sd, tau) in enumerate(zip(self.noise.sd, self.noise.tau, strict=True)):
-            a = float(np.exp(-dt / tau)) if tau > 0 else 0.0
-            scaled = white[:, c] * np.sqrt(1 - a**2)
-            scaled[0] = white[0, c]
-            out[:, c] = sd * scipy.signal.lfilter([1.0], [1.0, -a], scaled)
-        return out
 
 
 def _starts(simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> FloatArray:

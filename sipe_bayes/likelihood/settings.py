@@ -38,12 +38,10 @@ def check_settings(starts: object, fit: object, noise_sd: object, zero: bool = T
         raise ValueError(
             f"noise_sd: expected one sd for each channel, None where unknown, got {noise_sd!r}; such as (0.01, None)"
         )
+    least, words = (0.0, "not below") if zero else (1e-300, "above")
     for sd in noise_sd:
-        least = 0.0 if zero else 1e-300
         if sd is not None and not (isinstance(sd, Real) and least <= float(sd) < math.inf):
-            raise ValueError(
-                f"noise_sd: expected finite sds {'not below' if zero else 'above'} zero, got {sd!r}; None where unknown"
-            )
+            raise ValueError(f"noise_sd: expected finite sds {words} zero, got {sd!r}; None where unknown")
 
 
 @dataclass(frozen=True)
@@ -118,16 +116,13 @@ def chosen_channels(
 ) -> list[int]:
     """Which channels ``fit`` names, default all; raises ValueError for unknown ones and other sizes."""
     environment = simulator.environment
-    if trajectories.observations.shape[2] != len(environment.channels):
-        raise ValueError(
-            f"trajectories: expected observations of the {len(environment.channels)} channels "
-            f"{list(environment.channels)}, got {trajectories.observations.shape[2]}"
-        )
-    if trajectories.actions.shape[2] != environment.num_actions:
-        raise ValueError(
-            f"trajectories: expected {environment.num_actions} actions, got {trajectories.actions.shape[2]}"
-        )
-    return fitted_channels(environment.channels, fit)
+    names, measured = list(environment.channels), trajectories.observations.shape[2]
+    if measured != len(names):
+        raise ValueError(f"trajectories: expected observations of the {len(names)} channels {names}, got {measured}")
+    commands = trajectories.actions.shape[2]
+    if commands != environment.num_actions:
+        raise ValueError(f"trajectories: expected {environment.num_actions} actions, got {commands}")
+    return fitted_channels(names, fit)
 
 
 def fitted_channels(names: Sequence[str], fit: tuple[str, ...] | None) -> list[int]:
@@ -161,10 +156,9 @@ def check_seen(names: Sequence[str], seen: BoolArray) -> None:
 
 def check_prompt(names: Sequence[str], remembers: FloatArray, dt: float) -> None:
     """Raise ValueError where channels (C,) tell of what was more than a control step ago."""
-    slow = [(name, seconds) for name, seconds in zip(names, remembers.tolist(), strict=True) if seconds > dt]
-    if slow:
-        name, seconds = slow[0]
-        raise ValueError(
-            f"likelihood: StateSpace can not follow {name!r}, whose delay or filter may reach back {seconds:.3g} s, "
-            f"more than a control step of {dt:.3g} s; use windows, Segments(), or narrower bounds"
-        )
+    for name, seconds in zip(names, remembers.tolist(), strict=True):
+        if seconds > dt:
+            raise ValueError(
+                f"likelihood: StateSpace can not follow {name!r}, whose delay or filter may reach back {seconds:.3g} "
+                f"s, more than a control step of {dt:.3g} s; use windows, Segments(), or narrower bounds"
+            )
