@@ -5,10 +5,8 @@
 
 The blocks are the starts of windows that share a noise sample (``likelihood.restricted``), or the states of a chain
 (``likelihood.state_space``). LAPACK factorises A as a banded matrix in O(K D^3). Eliminating x leaves Schur's
-complement B - C' A^-1 C for theta, and the likelihood with x integrated out follows from log|A|. The covariances of
-neighbouring blocks come from the factor by Takahashi's recursion: the inverse is never formed as a whole.
-
-The recursion is that of
+complement B - C' A^-1 C for theta, and the likelihood with x integrated out follows from log|A|. Covariances of
+neighbouring blocks come from the factor by Takahashi's recursion, without the whole inverse:
 
 - K. Takahashi, J. Fagan, M.-S. Chin, "Formation of a sparse bus impedance matrix and its application to short circuit
   study", 1973; in the block form that Rauch, Tung and Striebel's smoother has.
@@ -20,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 from scipy.linalg.lapack import dpbtrf, dpbtrs
 
@@ -157,3 +156,17 @@ def inverse(precision: FloatArray) -> tuple[FloatArray, float]:
     eigenvalues, axes = np.linalg.eigh(sd[:, None] * precision * sd)
     kept = np.maximum(eigenvalues, 1e-12)  # what rounding leaves of an open direction
     return sd[:, None] * ((axes / kept) @ axes.T) * sd, float(np.log(kept).sum() - 2 * np.log(sd).sum())
+
+
+def damped_box_step(hessian: FloatArray, gradient: FloatArray, theta: FloatArray, damping: float) -> FloatArray:
+    """Step (N,) within the unit cube around theta that maximises a quadratic model, by MuJoCo's mju_boxQP.
+
+    Of the precision (N, N) and the pull (N,) there, damped by a share of the diagonal (Levenberg, Marquardt); zero
+    where rounding leaves no positive definite model.
+    """
+    n = len(theta)
+    # parameters that change nothing leave a zero on the diagonal
+    damped = hessian + damping * np.diag(np.diag(hessian)) + 1e-12 * np.trace(hessian) / n * np.eye(n)
+    step, factor, index = np.zeros(n), np.zeros((n, n + 7)), np.zeros(n, np.int32)
+    rank = mujoco.mju_boxQP(step, factor, index, damped, -gradient, -theta, 1 - theta)
+    return step if rank >= 0 else np.zeros(n)

@@ -1,9 +1,9 @@
 """Noise-free products of a linearisation's rows, from which the normal equations follow for any noise.
 
-Linearised at (theta, starts), the residual of window w is r - J_theta dtheta - J_x dx_w. Because sample j is whitened
-with sample j-1, which may lie in the window before, the whitened rows of w have the columns
-[theta (N) | x_w (D) | x_{w-1} (D) | r]. Their products are sums of three moment matrices that do not depend on (sigma,
-tau), so the noise can be re-estimated without touching the samples again.
+Linearised at (theta, starts), the residual of window w is r - J_theta dtheta - J_x dx_w. Sample j is whitened with
+sample j-1, which may lie in the window before. So the whitened rows of w have the columns
+[theta (N) | x_w (D) | x_{w-1} (D) | r]. Their products are sums of three moment matrices that do not depend on
+(sigma, tau): the noise can be re-estimated without touching the samples again.
 """
 
 from __future__ import annotations
@@ -40,26 +40,23 @@ class Moments:
         all_sequences: list[Sequence],
         white: bool = False,
     ) -> None:
-        windows, length, channels, columns = jacobian.shape
+        windows, _, channels, columns = jacobian.shape
         self.num_theta, self.num_start = num_theta, columns - num_theta
         self.windows = windows if self.num_start else 1
         self.sequences = all_sequences
+        rows = np.concatenate([jacobian, residual[..., None]], axis=-1).transpose(2, 0, 1, 3)
         if white:
-            rows = np.concatenate([jacobian, residual[..., None]], axis=-1).transpose(2, 0, 1, 3)
             rows = rows.reshape(channels, self.windows, -1, columns + 1)
             self.gaps, self.owner = np.full(channels, np.inf), np.arange(channels)
             self.counts = np.array([len(s.index) for s in all_sequences])
             squares = np.zeros((channels, 2, self.windows, 2 * columns + 2, 2 * columns + 2))
             squares[:, 0, :, : columns + 1, : columns + 1] = np.swapaxes(rows, 2, 3) @ rows
-            self.products = self._spread(squares).reshape(3 * channels, -1)
-            return
-        self.gaps = np.concatenate([s.gaps for s in all_sequences])
-        self.owner = np.repeat(np.arange(channels), [len(s.gaps) for s in all_sequences])
-        self.counts = np.concatenate([np.bincount(s.gap, minlength=len(s.gaps)) for s in all_sequences])
-        rows = np.empty((channels, windows * length, columns + 1))
-        rows[:, :, :-1] = np.moveaxis(jacobian, 2, 0).reshape(channels, windows * length, columns)
-        rows[:, :, -1] = np.moveaxis(residual, 2, 0).reshape(channels, windows * length)
-        squares = np.concatenate([self._squares(rows[c], s) for c, s in enumerate(all_sequences)])
+        else:
+            rows = rows.reshape(channels, -1, columns + 1)
+            self.gaps = np.concatenate([s.gaps for s in all_sequences])
+            self.owner = np.repeat(np.arange(channels), [len(s.gaps) for s in all_sequences])
+            self.counts = np.concatenate([np.bincount(s.gap, minlength=len(s.gaps)) for s in all_sequences])
+            squares = np.concatenate([self._squares(rows[c], s) for c, s in enumerate(all_sequences)])
         self.products = self._spread(squares).reshape(3 * len(self.gaps), -1)
 
     def _squares(self, rows: FloatArray, s: Sequence) -> FloatArray:

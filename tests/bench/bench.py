@@ -184,7 +184,7 @@ def starts() -> None:
 
 STAGES = {  # stage: (file, function) pairs whose cumulative seconds it is; none of a stage calls another of it
     "simulate": (("simulation/simulator.py", "rollout"),),
-    "noise": (("likelihood/noise.py", "estimate_noise"), ("likelihood/noise_spread.py", "noise_cloud")),
+    "noise": (("likelihood/restricted.py", "estimate_noise"), ("likelihood/restricted.py", "noise_cloud")),
 }
 
 

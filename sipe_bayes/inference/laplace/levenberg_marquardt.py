@@ -1,47 +1,41 @@
-"""Levenberg-Marquardt steps within the unit cube: the one way in which every search of ``laplace`` goes downhill.
+"""Levenberg-Marquardt steps within the unit cube, for the searches over a chain of states.
 
-An energy, -log of likelihood x prior, is known at a point and linearised there. What depends on theta alone to first
-order (windows' starts, states) is eliminated; a small quadratic programme over theta is left,
+An energy, -log of likelihood x prior, is known at a point and linearised there. The states are eliminated. A quadratic
+programme over theta is left,
 
     minimise over s:  1/2 s' (H + damping diag H) s - g' s,   0 <= theta + s <= 1,
 
-solved by MuJoCo's mju_boxQP. K. Levenberg 1944, "A method for the solution of certain non-linear problems in least
+which MuJoCo's mju_boxQP solves. K. Levenberg 1944, "A method for the solution of certain non-linear problems in least
 squares", Q. Appl. Math. 2; D. Marquardt 1963, "An algorithm for least-squares estimation of nonlinear parameters",
-J. SIAM 11. A step into a diverged or unphysical simulation is refused and shortened, so one bad rollout costs one
-step, not the fit.
-
-**How steps are damped** is said in one place: ``DampingRule.after``.
+J. SIAM 11. A step into a simulation that diverges is refused and shortened. ``DampingRule`` says how steps are damped.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Generic, Protocol, TypeVar
+from typing import ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
-from sipe_bayes.likelihood.minimise import damped_box_step
+from sipe_bayes.likelihood.block_tridiagonal import damped_box_step
 
 
 @dataclass(frozen=True)
 class DampingRule(Options):
     """How the damping of a step follows from the one before."""
 
-    first: float = option(1e-4, "damping of the first step, nearly Gauss and Newton's", above=0)
-    shrink: float = option(0.2, "factor after a step that lowered the energy", above=0, below=1)
-    grow: float = option(8.0, "factor after one that did not", above=1)
-    least: float = option(1e-9, "below it rounding rules", above=0)
-    most: float = option(1e6, "above it a step is none, and the search stands still", above=0)
+    first: ClassVar[float] = 1e-4  # nearly Gauss and Newton's
+    most: ClassVar[float] = 1e6  # above it a step is none
     least_refused: float = option(0.0, "damping before it grows, at least", least=0)
 
     def after(self, damping: float, lowered: bool) -> float:
         """The damping of the next step, after one that ``lowered`` the energy or did not."""
         if lowered:
-            return max(self.least, damping * self.shrink)
-        return max(damping, self.least_refused) * self.grow
+            return max(1e-9, damping * 0.2)  # below it rounding rules
+        return max(damping, self.least_refused) * 8.0
 
 
 @dataclass(frozen=True)
@@ -64,10 +58,6 @@ class QuadraticModel:
         """Nats by which a step (N,) of theta is to lower the energy."""
         return float(self.gradient @ move - 0.5 * move @ self.hessian @ move) + 0.5 * self.explained
 
-    def step(self, theta: FloatArray, damping: float) -> FloatArray:
-        """Minimiser (N,) of the damped model within the unit cube around theta (N,); zero where there is none."""
-        return damped_box_step(self.hessian, self.gradient, theta, damping)
-
 
 P = TypeVar("P")
 P_co = TypeVar("P_co", covariant=True)
@@ -85,102 +75,58 @@ class LinearisedEnergy(Protocol[P_co]):
         """The energy there."""
 
     def model(self, damping: float) -> QuadraticModel:
-        """The quadratic model with what is eliminated damped as well.
-
-        Raises:
-            np.linalg.LinAlgError: where rounding leaves none.
-        """
+        """The quadratic model, damped also in what is eliminated; raises LinAlgError where rounding leaves none."""
 
     def simulated(self, theta: FloatArray, change: FloatArray) -> tuple[P_co, float]:
-        """The point at theta (N,) where what is eliminated has changed by ``change``, and its energy by simulation.
-
-        The energy is infinite where the simulation diverges.
-        """
+        """The point at theta (N,) with what is eliminated changed, and its energy: infinite where it diverges."""
 
 
 @dataclass(frozen=True)
 class Descent(Generic[P]):
-    """What came of trying to go downhill.
-
-    Args:
-        point: where the step led; None where none was taken.
-        energy: there, or where it stands.
-        damping: of the next step.
-        converged: whether there is nothing left to gain, or no step gained what was expected.
-        expected: nats that the step was to gain; infinite where a stale linearisation's step was refused.
-        gained: nats that it gained.
-        refused: most nats that a step was to gain which gained nothing.
-        exhausted: whether steps were refused until there was none, not until one was to gain too little.
-    """
+    """Where a step led (None: no step lowered the energy), the energy there, and the damping of the next step."""
 
     point: P | None
     energy: float
     damping: float
-    converged: bool = False
-    expected: float = 0.0
-    gained: float = 0.0
-    refused: float = 0.0
-    exhausted: bool = False
 
 
-def descend(
-    linearised: LinearisedEnergy[P], damping: float, tolerance: float, rule: DampingRule, stale: bool = False
-) -> Descent[P]:
+def descend(linearised: LinearisedEnergy[P], damping: float, tolerance: float, rule: DampingRule) -> Descent[P]:
     """The first of ever shorter damped steps that lowers the energy.
 
-    Where damping left over from earlier steps is why nothing is to be gained, one nearly undamped step is tried as
-    well: at a kink, as of dry friction, damping grows until it promises nothing, whatever the slope says.
-
-    Args:
-        linearised: the energy at a point and around it.
-        damping: of the first step tried.
-        tolerance: nats; where a step is to gain less the search has converged.
-        rule: how the damping changes.
-        stale: whether the linearisation is of an earlier point; a refused step is then left to a fresh one.
+    Where it gains less than ``tolerance`` nats, and damping of earlier steps may be why, one nearly undamped step is
+    tried as well: at a kink, as of dry friction, damping grows until a step promises nothing.
     """
-    fit = _shortened(linearised, damping, tolerance, rule, stale)
-    step = _tried(linearised, rule.first, tolerance) if fit.converged and damping > rule.first else None
-    if step is None or step.converged:
+    fit = _shorten(linearised, damping, tolerance, rule)
+    if linearised.energy - fit.energy >= tolerance or damping <= rule.first:
         return fit
-    if step.gained > fit.gained:
-        return replace(step, damping=rule.after(rule.first, lowered=True), converged=step.gained < tolerance)
-    return replace(fit, expected=np.inf, converged=False) if stale else replace(fit, refused=step.expected)
+    undamped = _try(linearised, rule.first, tolerance)
+    if undamped is None or undamped.energy >= fit.energy:
+        return fit
+    return replace(undamped, damping=rule.after(rule.first, lowered=True))
 
 
-def _shortened(
-    linearised: LinearisedEnergy[P], damping: float, tolerance: float, rule: DampingRule, stale: bool
-) -> Descent[P]:
+def _shorten(linearised: LinearisedEnergy[P], damping: float, tolerance: float, rule: DampingRule) -> Descent[P]:
     """The first of ever shorter steps that lowers the energy, from one damping on."""
     standing: Descent[P] = Descent(None, linearised.energy, damping)
-    refused = 0.0
     while damping <= rule.most:
-        step = _tried(linearised, damping, tolerance)
-        if step is not None and step.converged:
-            return replace(standing, converged=True, refused=refused)
-        if step is not None and step.point is not None:
-            return replace(step, damping=rule.after(damping, lowered=True), converged=step.gained < tolerance)
-        if step is not None and stale:
-            return replace(standing, expected=np.inf)
-        damping, refused = rule.after(damping, lowered=False), max(refused, step.expected if step else 0.0)
-    return replace(standing, converged=True, refused=refused, exhausted=True)
+        step = _try(linearised, damping, tolerance)
+        if step is None:
+            return standing
+        if step.point is not None:
+            return replace(step, damping=rule.after(damping, lowered=True))
+        damping = rule.after(damping, lowered=False)
+    return standing
 
 
-def _tried(linearised: LinearisedEnergy[P], damping: float, tolerance: float) -> Descent[P] | None:
-    """A damped step: converged where it is to gain less than ``tolerance``, without a point where it gained nothing.
-
-    None where rounding leaves no model.
-    """
+def _try(linearised: LinearisedEnergy[P], damping: float, tolerance: float) -> Descent[P] | None:
+    """A damped step, without a point where it gained nothing; None where it is to gain less than ``tolerance``."""
+    refused: Descent[P] = Descent(None, linearised.energy, damping)
     try:
         model = linearised.model(damping)
     except np.linalg.LinAlgError:
+        return refused
+    move = damped_box_step(model.hessian, model.gradient, linearised.theta, damping)
+    if model.gain(move) < tolerance:
         return None
-    move = model.step(linearised.theta, damping)
-    expected = model.gain(move)
-    if expected < tolerance:
-        return Descent(None, linearised.energy, damping, converged=True, expected=expected)
-    theta = np.clip(linearised.theta + move, 0.0, 1.0)
-    point, energy = linearised.simulated(theta, model.rest(move))
-    gained = linearised.energy - energy
-    if gained > 0:
-        return Descent(point, energy, damping, expected=expected, gained=gained)
-    return Descent(None, linearised.energy, damping, expected=expected)
+    point, energy = linearised.simulated(np.clip(linearised.theta + move, 0.0, 1.0), model.rest(move))
+    return Descent(point, energy, damping) if energy < linearised.energy else refused

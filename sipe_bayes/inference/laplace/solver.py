@@ -14,7 +14,7 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
    first step holds plain against generalised least squares (``_noise_takes_over``).
 3. COMPARE: the plain fit and the posterior mode each run free along the whole training logs. Where the mode is worse by
    more than 3 %, coloured noise explains what parameters should. Then the estimate is that of white noise, fitted again
-   from the plain fit. The interval is the sandwich (``likelihood.noise_spread``), which holds for coloured residuals.
+   from the plain fit. The interval is the sandwich (``likelihood.restricted``), which holds for coloured residuals.
    Where that is worse than the plain fit, too, ``behind_plain`` says so.
 
 **Differences** of theta run along the principal axes of the posterior and are a third of its sd along each. So slopes
@@ -31,7 +31,7 @@ looked for from there. All are kept, weighted by their evidence.
 
 **Impacts** make simulations jump. There beginnings of the segments are fitted first, two control steps and then ever
 more. On the shortest ones plain fits go down from the nominal model and the best of some draws from the prior; the best
-end is followed, and the next one where residuals stay larger than the known noise (``energy.beyond_known_noise``).
+end is followed, and the next one where residuals stay larger than the known noise (``optimum.beyond_known_noise``).
 
 **Limit**: four points do not reach every optimum. Of two that a few segments do not tell apart the other is not found.
 
@@ -53,22 +53,23 @@ from scipy.stats import chi2
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.findings import Code, finding
-from sipe_bayes.inference.laplace.energy import (
+from sipe_bayes.inference.laplace.optimum import (
     WindowEnergy,
+    WindowOptimum,
+    WindowState,
     beyond_known_noise,
     misfit,
     present_noise,
     same_noise,
+    summarised,
     updated_noise,
 )
-from sipe_bayes.inference.laplace.optimum import WindowOptimum, WindowState, summarised
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.likelihood.minimise import damped_box_step
+from sipe_bayes.likelihood.block_tridiagonal import damped_box_step
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.noise_spread import sandwich
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION
-from sipe_bayes.likelihood.restricted import eliminate_starts, marginal
+from sipe_bayes.likelihood.restricted import eliminate_starts, marginal, sandwich
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.wild_samples import wild_residuals
 from sipe_bayes.likelihood.windows import Linearisation, Windows, inward

@@ -6,13 +6,13 @@ the starts' Jacobian,
     log p(theta | y) = log prior + max over noise of -1/2 [log|V| + log|A| + r' V^-1 r - b' A^-1 b + x' P_x x] + const,
     A = J_x' V^-1 J_x + P_x,   b = J_x' V^-1 r - P_x x.
 
-The starts are integrated out exactly where the prediction is linear in them over their (narrow) conditional posterior:
+The starts are integrated out exactly where the prediction is linear in them over their narrow conditional posterior:
 x(theta) = x_hat - S (theta - theta_hat) and J_x are those of the ``laplace`` optimum. Far off, or beyond an edge where
-theta stops to matter, no starts lie along that slope: where the step that remains promises a nat, the starts are also
-simulated as they are at the optimum, and the value is theirs unless following promises less by ten. The noise is
-integrated out by Laplace's method (L. Tierney, J. Kadane 1986, "Accurate Approximations for Posterior Moments and
-Marginal Densities", J. Am. Stat. Assoc. 81) under a flat prior on log sd and log tau, whose curvature at the optimum
-hardly depends on theta; exact for white noise of one channel whose starts are known.
+theta stops to matter, no starts lie along that slope. Where the step that remains promises a nat, they are also
+simulated as they are at the optimum; the value is theirs unless following promises less by ten. The noise is integrated
+out by Laplace's method (L. Tierney, J. Kadane 1986, "Accurate Approximations for Posterior Moments and Marginal
+Densities", J. Am. Stat. Assoc. 81) under a flat prior on log sd and log tau; exact for white noise of one channel whose
+starts are known.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.inference.laplace.energy import beyond_rounding, estimated, free_noise
-from sipe_bayes.inference.laplace.optimum import WindowOptimum
+from sipe_bayes.inference.laplace.optimum import WindowOptimum, beyond_rounding, estimated, free_noise
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.restricted import Pulls, marginal
@@ -33,8 +32,7 @@ from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 
-FORETOLD = 1.0  # nats, by which a step of starts or states that follow theta promises more than at the optimum
-FOLLOWED = 10.0  # nats, by which those that follow have to promise less than those that do not
+FORETOLD, FOLLOWED = 1.0, 10.0  # nats: that a step of starts that follow theta promises; by which less than those held
 
 
 def value_cost(windows: Windows | Chain) -> int:
@@ -124,9 +122,9 @@ class WindowTarget(Target):
     def _integrated(
         self, residual: FloatArray, jacobian: FloatArray, starts: FloatArray
     ) -> tuple[float, FloatArray, float]:
-        """Log-likelihood of a residual (W, L, C) at ``starts`` (W, D), up to a constant, with the noise that fits best.
+        """``marginal`` of a residual (W, L, C) at ``starts`` (W, D), with the noise that fits best.
 
-        And the best change (W, D) of the starts, with what it promises. jacobian (W, L, C, D): by the starts.
+        jacobian: (W, L, C, D), by the starts.
         """
         windows, nothing = self.windows, np.zeros(0)
         moments = Moments(residual, jacobian, 0, windows.sequences, windows.settings.noise == "white")

@@ -26,8 +26,7 @@ import scipy.optimize
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.inference.laplace.state_space.options import NoiseTuning
 from sipe_bayes.inference.laplace.state_space.smoother import border
-from sipe_bayes.likelihood.block_tridiagonal import Border
-from sipe_bayes.likelihood.minimise import damped_box_step
+from sipe_bayes.likelihood.block_tridiagonal import Border, damped_box_step
 from sipe_bayes.likelihood.noise import NORMAL_MAD
 from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
 from sipe_bayes.likelihood.state_space.chain import Chain
