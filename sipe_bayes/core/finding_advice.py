@@ -78,8 +78,8 @@ ADVICE: dict[Code, str] = {
         "`measurements.noise_sd` where it is known."
     ),
     Code.NOT_THE_NORMAL: (
-        "Contact makes the likelihood many-valleyed, and the search stands in a valley that its curvature does not "
-        "describe. Give `search.restarts` and a larger `budget`, cut the logs shorter, or measure velocities."
+        "The posterior bends more than a normal follows, or the search stands at a local optimum between contacts. "
+        f"Give `search.restarts` and a larger `budget`, cut the logs shorter, or measure velocities. {_COMPARE}"
     ),
     Code.STARTS_CONTRADICT: (
         "Two searches ended in trajectories that exclude each other. Give `search.restarts` and a larger `budget`, cut "
@@ -125,7 +125,6 @@ ADVICE: dict[Code, str] = {
         "Raise `budget`, with another `--out`: the search then begins from more places. Shorter windows have fewer "
         "valleys. If nothing helps, the model lacks something: `sipe discover`."
     ),
-    Code.TOO_FEW_DRAWS: f"The posterior bends more than a normal follows. {_COMPARE}",
     Code.NONLINEAR_STARTS: "Starts are marginalised by a linearisation, which fails over long windows. Halve `window`.",
     Code.NONLINEAR_STATES: "As of starts: states between contacts are linearised. Hold it against `laplace`.",
     Code.NO_EFFECT: (
@@ -174,7 +173,6 @@ ADVICE: dict[Code, str] = {
     Code.MISFIT: _REMEDY_LACKING,
     Code.MISFIT_SHIFTS: (f"{_REMEDY_LACKING} Until then read the values as those of a model that is wrong."),
     Code.BEHIND_PLAIN: "Initial states or noise explain what parameters should. Run `sipe discover`.",
-    Code.SEGMENTS_THINNED: "Nothing to do. To use all of them, cut the logs into several runs with `prior.from`.",
     Code.LEAST_SQUARES: "Run `sipe discover`: it looks for the physics that the model lacks.",
     Code.NOISE_DRIFTS: (
         "A model that lacks something leaves such residuals, or a zero that differs between logs: run `sipe discover`. "

@@ -143,9 +143,8 @@ class Code(Enum):
     SEPARATE_OPTIMA = caution("the search found {count} separate optima; the posterior is a mixture of them")
     PROCESS_NOISE_UNSETTLED = blocking("the process noise has not converged: do not rely on the intervals")
     NOT_THE_NORMAL = blocking(
-        "around the optimum the likelihood is not the normal that the intervals are taken from (Pareto k = {k:.1f}, "
-        "{effective:.0f} of {draws} draws effective), as in a wrong valley between contacts: do not rely on the "
-        "intervals; more restarts, shorter logs or more measured channels may help"
+        "The posterior is not the normal that the intervals are taken from: {effective:.1f} of {draws} draws are "
+        "effective. Do not rely on the intervals. Compare with mcmc; or give restarts, shorter logs or more channels"
     )
     STARTS_CONTRADICT = blocking(
         "another start of the search ended {distance:.0f} sds away, where process noise explains so much of the logs "
@@ -187,10 +186,6 @@ class Code(Enum):
     BEYOND_START_NOISE = blocking(
         "The residuals are {times:.1f} times the known measurement noise: the search ended at a wrong optimum, or the "
         "model lacks something. Raise the budget and the restarts"
-    )
-    TOO_FEW_DRAWS = blocking(
-        "the posterior is no normal, and {draws} draws from it came to {effective:.1f} effective ones: compare with "
-        "mcmc before you trust the intervals"
     )
 
     # mcmc
@@ -245,7 +240,6 @@ class Code(Enum):
         "Free simulations of the training logs miss by {error:.2g} % of the motion with the estimates, and by "
         "{plain:.2g} % with plain least squares"
     )
-    SEGMENTS_THINNED = note("The fit uses {used} of {segments} segments, spread evenly over the logs")
     LEAST_SQUARES = note(
         "Plain and generalised least squares differ by more than coloured noise allows (Hausman test, p < 0.001). "
         "The estimates are those of plain least squares. Their intervals allow for the correlation of the residuals"

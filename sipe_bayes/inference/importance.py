@@ -28,6 +28,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -45,25 +46,25 @@ class ImportanceTuning(Options):
     """When draws take the normal's place, how they are drawn, and when they are enough."""
 
     wanted: bool = option(True, "whether an optimum's normal is held against the posterior, and draws take its place")
-    probe: float = option(2.0, "how far from the optimum the log posterior is looked at", "sd", above=0)
-    slack: float = option(0.5, "by which falls of the log posterior may differ for rounding's sake", "nats", least=0)
-    least_fall: float = option(0.6, "a fall, over that of the normal, with which it stands", above=0, below=1)
-    most_fall: float = option(2.0, "the same above", above=1)
-    batch: int = option(24, "draws of a batch, or two for each dimension", least=1)
-    most_batches: int = option(20, "batches at most", least=1)
-    hopeless_after: int = option(6, "batches with less than one effective draw each after which it ends", least=1)
-    first_share: float = option(0.5, "share of the first batch that comes from the prior", above=0, below=1)
-    share: float = option(0.1, "share of later ones: bounds the weights", above=0, below=1)
-    first_wider: float = option(1.5, "width of the first proposal over the normal's", above=0)
-    wider: float = option(0.3, "by how much wider than the draws' later ones are, over the root of N", above=0)
-    elsewhere: float = option(3.0, "by which a draw is better than an optimum that is none", "nats", above=0)
-    enough: float = option(100.0, "effective draws with which it ends", above=1)
-    least: float = option(30.0, "effective draws that may be relied on", above=1)
-    judges: int = option(120, "draws that judge a normal: 33 of them are the tail that its k is fitted to", least=40)
-    most_share: float = option(0.25, "of the budget that a search leaves to them, at most", least=0, most=1)
-    at_once: int = option(50_000, "control steps simulated at a time when a normal is judged: memory", least=1)
-    kernels: int = option(60, "kernels of the posterior", least=2)
-    narrower: float = option(0.5, "width of kernels over Silverman's rule, for the bounds' sake", above=0, below=1)
+    probe: ClassVar[float] = 2.0  # how far from the optimum the log posterior is looked at (sd)
+    slack: ClassVar[float] = 0.5  # by which falls of the log posterior may differ for rounding's sake (nats)
+    least_fall: ClassVar[float] = 0.6  # a fall, over that of the normal, with which it stands
+    most_fall: ClassVar[float] = 2.0  # the same above
+    batch: ClassVar[int] = 24  # draws of a batch, or two for each dimension
+    most_batches: ClassVar[int] = 20  # batches at most
+    hopeless_after: ClassVar[int] = 6  # batches with less than one effective draw each after which it ends
+    first_share: ClassVar[float] = 0.5  # share of the first batch that comes from the prior
+    share: ClassVar[float] = 0.1  # share of later ones: bounds the weights
+    first_wider: ClassVar[float] = 1.5  # width of the first proposal over the normal's
+    wider: ClassVar[float] = 0.3  # by how much wider than the draws' later ones are, over the root of N
+    elsewhere: ClassVar[float] = 3.0  # by which a draw is better than an optimum that is none (nats)
+    enough: ClassVar[float] = 100.0  # effective draws with which it ends
+    least: ClassVar[float] = 30.0  # effective draws that may be relied on
+    judges: ClassVar[int] = 120  # draws that judge a normal: 33 of them are the tail that its k is fitted to
+    most_share: ClassVar[float] = 0.25  # of the budget that a search leaves to them, at most
+    at_once: ClassVar[int] = 50_000  # control steps simulated at a time when a normal is judged: memory
+    kernels: ClassVar[int] = 60  # kernels of the posterior
+    narrower: ClassVar[float] = 0.5  # width of kernels over Silverman's rule, for the bounds' sake
 
     def width(self, size: int) -> float:
         """Of later proposals over the draws' in ``size`` dimensions."""

@@ -13,24 +13,23 @@ normal is for a given place along it. Where several parameters alone have one, o
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.options import Options, option
 from sipe_bayes.inference.importance import Target
 
 
-@dataclass(frozen=True)
-class StretchTuning(Options):
+class StretchTuning:
     """How far a posterior is looked at beyond its normal, and what counts."""
 
-    near: float = option(2.0, "the nearer points", "sd", above=0)
-    far: float = option(8.0, "the further ones; where the density holds on, twice as far again", "sd", above=0)
-    slack: float = option(0.5, "by which falls of the log posterior may differ for rounding's sake", "nats", least=0)
-    least_fall: float = option(0.6, "a fall, over that of the normal, which is none too small", above=0, below=1)
-    unseen: float = option(0.01, "of the normal's mass, which a stretch has to have to count", above=0, below=1)
-    most: int = option(6, "stretches drawn from", least=1)
+    near: ClassVar[float] = 2.0  # sds, the nearer points
+    far: ClassVar[float] = 8.0  # sds, the further ones; where the density holds on, twice as far again
+    slack: ClassVar[float] = 0.5  # nats, by which falls of the log posterior may differ for rounding's sake
+    least_fall: ClassVar[float] = 0.6  # a fall, over that of the normal, which is none too small
+    unseen: ClassVar[float] = 0.01  # of the normal's mass, which a stretch has to have to count
+    most: ClassVar[int] = 6  # stretches drawn from
 
     def least_worth(self, length: FloatArray) -> FloatArray:
         """Falls (...), in nats, below which what lies along lengths (...), in sds, counts."""

@@ -59,7 +59,7 @@ def test_the_normal_alone_would_be_wrong() -> None:
     estimator = Laplace(skewed(), seed=1, budget=40)
     found = estimator.fit(np.full(2, 0.08))
     assert estimator.diagnostics["draws"]["draws"] == 0
-    assert Code.TOO_FEW_DRAWS in {one.code for one in estimator.findings.blocking}
+    assert Code.NOT_THE_NORMAL in {one.code for one in estimator.findings.blocking}
     assert np.abs(found.quantile([0.05, 0.95]).numpy()[:, 0] - exact(3.0, 0.08, [0.05, 0.95])).max() > 0.06
 
 

@@ -1,10 +1,9 @@
 """Draws in the place of segments' normals: where one is not the posterior, or where several optima share it.
 
 Each optimum's normal is probed two sds along each parameter's direction (``importance.is_normal``), where starts are
-estimated only if it leaves one open, and that of a single one looked beyond (``inference.stretches``). Where all
-stand and nothing lies beyond, they are the posterior, shared by their evidence. Optima with hardly any mass are left
-out of this, and several are not asked about where starts are estimated, which follow one optimum alone; nor is any
-through impacts.
+estimated only if it leaves one open; a single one is also looked beyond (``inference.stretches``). Where all stand and
+nothing lies beyond, they are the posterior. Nothing is asked of optima with hardly any mass, of several where starts
+are estimated, which follow one optimum alone, and through impacts.
 
 The first batches come from each optimum's normal, widened, and from a normal along each stretch; the later ones from
 normals with the moments of what was drawn around an optimum (``importance.draw``).
@@ -17,33 +16,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference import importance
 from sipe_bayes.inference.importance import Draws
 from sipe_bayes.inference.laplace.optimum import WindowOptimum
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, mixture
 from sipe_bayes.inference.laplace.target import WindowFit, WindowTarget, value_cost
-from sipe_bayes.inference.stretches import Stretch, look_size, proposals, stretches
+from sipe_bayes.inference.stretches import look_size, proposals, stretches
 from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.windows import Windows
 
-_OPEN = 0.5  # an sd, of the range, from which the slope at the optimum is nought: elsewhere it may be steep
-
 
 @dataclass(frozen=True)
-class Probe:
+class Look:
     """What is known of the posterior around the optima of a search that has ended.
 
     Args:
         draws: those that take the normals' place; None where these stand or nothing was asked.
-        given: batches of them whose proposals the draws did not make.
         judged: whether the budget sufficed for what was asked.
-        stands: whether the normals were seen to be the posterior.
+        better: (N,), a draw that is so much better than all optima that these are none; None without one.
     """
 
     draws: Draws | None = None
-    given: int = 0
     judged: bool = True
-    stands: bool = False
+    better: FloatArray | None = None
 
 
 def sharing(kept: Sequence[Optimum], problem: SearchProblem) -> list[Optimum]:
@@ -52,68 +48,65 @@ def sharing(kept: Sequence[Optimum], problem: SearchProblem) -> list[Optimum]:
     return [one for one in kept if one.evidence >= least]
 
 
-def draw_size(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) -> int:
-    """Simulations of the logs that one more batch of draws takes, with a linearisation and the optima's values."""
-    values = importance.batch_size(len(problem.space), problem.options.tuning.importance) + len(sharing(kept, problem))
-    return value_cost(windows) * values + windows.num_start + 1
-
-
-def target_at(problem: SearchProblem, windows: Windows, optimum: Optimum) -> WindowTarget:
-    """The log posterior, with starts that follow theta from an optimum."""
-    assert isinstance(optimum, WindowOptimum)
-    return WindowTarget(problem.prior, windows, WindowFit.at(windows, optimum))
-
-
-def probed(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) -> Probe:
-    """Ask whether the optima's normals are the posterior, and draw first batches where they are not.
+def look_beyond(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) -> Look:
+    """Ask whether the optima's normals are the posterior, and draw where they are not.
 
     kept: the distinct ones, best first.
     """
-    best, tuning, n = kept[0], problem.options.tuning.importance, len(problem.space)
-    if not tuning.wanted:
-        return Probe()
-    if windows.settings.noise == "sandwich" or windows.impacts:
-        return Probe()
-    shared = sharing(kept, problem)
-    if len(shared) > 1 and windows.num_start:
-        return Probe()
-    sds = np.sqrt([np.diag(one.covariance) for one in shared])
-    probes = len(shared) * importance.probe_size(n) if not windows.num_start or sds.max() > _OPEN else 0
-    look = value_cost(windows) * look_size(n, near=False) if len(shared) == 1 else 0
+    tuning, shared = problem.options.tuning.importance, sharing(kept, problem)
+    asked = tuning.wanted and windows.settings.noise != "sandwich" and not windows.impacts
+    if not asked or (len(shared) > 1 and windows.num_start):
+        return Look()
+    n, cost, single = len(problem.space), value_cost(windows), len(shared) == 1
+    # elsewhere the slope of starts at an optimum may be steep; from half of the range on it is none
+    open_sd = max(np.sqrt(np.diag(one.covariance)).max() for one in shared) > 0.5
+    probes = len(shared) * importance.probe_size(n) if not windows.num_start or open_sd else 0
+    look = cost * look_size(n, near=False) if single else 0
     if not windows.has_room(windows.num_start + probes + look):
-        return Probe(judged=False)
-    target = target_at(problem, windows, best)
+        return Look(judged=False)
+    assert isinstance(kept[0], WindowOptimum)
+    target = WindowTarget(problem.prior, windows, WindowFit.at(windows, kept[0]))
     if target.silent:
-        return Probe()
+        return Look()
     stands = not probes or all(
         importance.is_normal(target, one.theta, one.mean, one.covariance, tuning) for one in shared
     )
-    beyond: list[Stretch] = []
-    if len(shared) == 1:
+    first = [(one.mean, tuning.width(n) ** 2 * one.covariance) for one in shared]
+    if single:
+        best = shared[0]
         try:
             beyond = stretches(target, best.theta, best.mean, best.covariance, problem.options.tuning.stretches, False)
         except BudgetExhausted:
             windows.short = True
-            return Probe(judged=False)
-    if stands and not beyond:
-        return Probe(stands=True)
-    if len(shared) > 1:
-        first = [(one.mean, tuning.width(n) ** 2 * one.covariance) for one in shared]
-    else:
+            return Look(judged=False)
         first = [(best.mean, tuning.first_wider**2 * best.covariance), *proposals(beyond, best.covariance)]
-    draws = Draws.none(n)
-    for mean, covariance in first:
-        if not windows.has_room(draw_size(problem, windows, kept)):
+        stands = stands and not beyond
+    return Look() if stands else _draw(problem, windows, target, shared, first)
+
+
+def _draw(
+    problem: SearchProblem,
+    windows: Windows,
+    target: WindowTarget,
+    shared: list[Optimum],
+    first: list[tuple[FloatArray, FloatArray]],
+) -> Look:
+    """Draws from normals (mean, covariance) ``first``, then from those of the draws, as long as these promise more."""
+    tuning, normals, n = problem.options.tuning.importance, mixture(shared, problem.space), len(problem.space)
+    draws, highest = Draws.none(n), None
+    cost = value_cost(windows) * (importance.batch_size(n, tuning) + len(shared))
+    while windows.has_room(cost):
+        if draws.batches < len(first):
+            mean, covariance = first[draws.batches]
+            share = tuning.share if draws.batches else tuning.first_share
+            draws = importance.drawn_from(draws, target, mean, covariance, share, problem.prior, problem.seed, tuning)
+            continue
+        draws = importance.draw(draws, target, normals, problem.prior, problem.seed, tuning)
+        problem.tell(f"{len(draws.values)} importance draws", windows.rollouts)
+        if highest is None:
+            highest = target(np.stack([one.theta for one in shared])).max()
+        if draws.values.max() > highest + tuning.elsewhere:
+            return Look(draws, better=draws.points[draws.values.argmax()])
+        if importance.ended(draws, problem.prior, tuning, len(first)):
             break
-        share = tuning.share if draws.batches else tuning.first_share
-        draws = importance.drawn_from(draws, target, mean, covariance, share, problem.prior, problem.seed, tuning)
-    return Probe(draws, draws.batches, judged=draws.batches == len(first))
-
-
-def more(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum], draws: Draws) -> tuple[Draws, bool]:
-    """One more batch, and whether a draw is so much better than all optima that these are none."""
-    shared, tuning = sharing(kept, problem), problem.options.tuning.importance
-    normals, target = mixture(shared, problem.space), target_at(problem, windows, kept[0])
-    draws = importance.draw(draws, target, normals, problem.prior, problem.seed, tuning)
-    highest = target(np.stack([one.theta for one in shared])).max()
-    return draws, bool(draws.values.max() > highest + tuning.elsewhere)
+    return Look(draws, judged=draws.batches >= len(first))

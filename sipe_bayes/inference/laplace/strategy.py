@@ -1,9 +1,8 @@
 """What ``laplace`` asks of a search for optima, and what it gives it.
 
-A ``Strategy`` is a class for one kind of likelihood: ``SegmentSolver`` (segments of the logs), ``StateSpaceSearch``
-(every sample's state is unknown) and ``KnownStartSearch`` (the first states are known). It is made of a
-``SearchProblem`` and of the logs bound to their likelihood, writes ``start`` and ``step`` over its own frozen state,
-and hands over ``Optimum``s.
+A ``Strategy`` is a class for one kind of likelihood: ``SegmentSolver``, ``StateSpaceSearch`` and ``KnownStartSearch``.
+It is made of a ``SearchProblem`` and the bound logs, writes ``start`` and ``step`` over its own frozen state, and hands
+over ``Optimum``s.
 """
 
 from __future__ import annotations
@@ -64,20 +63,13 @@ class Optimum:
         gap = other.mean - self.mean
         return float(np.sqrt(gap @ np.linalg.solve(self.covariance, gap)))
 
-    def over(self, other: Optimum) -> float:
-        """How many times as wide as another one's its normal is, in the direction where it is most."""
-        root = np.linalg.cholesky(other.covariance)
-        ratios = np.linalg.solve(root, np.linalg.solve(root, self.covariance).T)
-        return float(np.sqrt(np.linalg.eigvalsh(ratios)[-1]))
-
     def resembles(self, mean: FloatArray, covariance: FloatArray, tolerance: float) -> bool:
         """Whether a normal's mean (N,) is as near, in sds, and its sds in any direction, as logarithms."""
         root = np.linalg.cholesky(self.covariance)
         gap = np.linalg.solve(root, mean - self.mean)
         ratios = np.linalg.eigvalsh(np.linalg.solve(root, np.linalg.solve(root, covariance).T))
-        return bool(
-            np.linalg.norm(gap) < tolerance and np.abs(0.5 * np.log(np.maximum(ratios, 1e-12))).max() < tolerance
-        )
+        widths = 0.5 * np.log(np.maximum(ratios, 1e-12))
+        return bool(np.linalg.norm(gap) < tolerance and np.abs(widths).max() < tolerance)
 
 
 @dataclass(frozen=True)
@@ -180,11 +172,7 @@ class Strategy(Protocol[S]):
         """The first state; may simulate."""
 
     def step(self, state: S) -> S:
-        """One affordable piece of work further; a state that is ``done`` ends the search.
-
-        Raises:
-            BudgetExhausted: the state that went in is kept.
-        """
+        """One affordable piece of work further; ``done`` ends the search, BudgetExhausted keeps the state."""
 
 
 def distinct(optima: Sequence[Optimum]) -> list[Optimum]:

@@ -212,6 +212,6 @@ def test_the_share_of_the_segments_is_told(monkeypatch: pytest.MonkeyPatch) -> N
     few = LaplaceTuning(solver=SolverTuning(linearised_steps=2e3))
     method = Laplace(servo(), likelihood=Segments(0.5), seed=0, tuning=few)
     method.fit(recorded(0, seconds=8.0))
-    (item,) = method.findings.of(Code.SEGMENTS_THINNED)
-    print(item.text)
-    assert "of 16 segments" in item.text
+    print(method.diagnostics)
+    assert method.diagnostics["segments"]["of"] == 16
+    assert method.diagnostics["segments"]["fitted"] < 16
