@@ -177,11 +177,13 @@ class Laplace(Estimator[LaplaceState]):
         return KnownStartSearch(self.problem, windows) if known else StateSpaceSearch(self.problem, windows)
 
     def _probed(self, windows: Windows | Chain, state: LaplaceState) -> LaplaceState:
-        """The state of a finished search; not done where the posterior is no normal and draws are to take its place."""
+        """The state of a finished search; not done where the search goes on."""
         ended = replace(state, done=True)
         if isinstance(windows, Chain):
             optima, may_lead = distinct(state.search.optima), self._may_lead(windows, state.search)
-            if self._lost(windows, optima[0], state.search):
+            best, most = optima[0], self.options.tuning.state_space.absorbed * windows.observed.sum()
+            assert isinstance(best, ChainOptimum)
+            if may_lead and best.absorbed > most:  # process noise explains much: segments may need less
                 return state
             state, target = self._judged(windows, state, optima)
             stands = not state.judgements or state.judgements[0].normal
@@ -208,13 +210,6 @@ class Laplace(Estimator[LaplaceState]):
         if not isinstance(search, StateSpaceState) or search.led or chain.determined.all():
             return False
         return not contacts_of(chain.simulator, [replace(log, states=None) for log in chain.trajectories]).change
-
-    def _lost(self, chain: Chain, optimum: Optimum, search: WindowState | StateSpaceState | KnownStartState) -> bool:
-        """Whether process noise explains much of a log of which not every state is told: segments may need less."""
-        if not isinstance(search, StateSpaceState) or not isinstance(optimum, ChainOptimum):
-            return False
-        led_astray = optimum.absorbed > self.options.tuning.state_space.absorbed * chain.observed.sum()
-        return self._may_lead(chain, search) and led_astray
 
     def _judged(
         self, chain: Chain, state: LaplaceState, kept: list[Optimum]
