@@ -19,17 +19,15 @@ from typing import ClassVar, Generic, Protocol, TypeVar
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.options import Options, option
 from sipe_bayes.likelihood.block_tridiagonal import damped_box_step
 
 
-@dataclass(frozen=True)
-class DampingRule(Options):
+class DampingRule:
     """How the damping of a step follows from the one before."""
 
     first: ClassVar[float] = 1e-4  # nearly Gauss and Newton's
     most: ClassVar[float] = 1e6  # above it a step is none
-    least_refused: float = option(0.0, "damping before it grows, at least", least=0)
+    least_refused: ClassVar[float] = 1e-4  # damping before it grows, at least: a refused step is far off
 
     def after(self, damping: float, lowered: bool) -> float:
         """The damping of the next step, after one that ``lowered`` the energy or did not."""

@@ -35,9 +35,9 @@ class LaplaceTuning(Options):
     """Numbers of the search that users hardly ever change."""
 
     stretches: ClassVar[StretchTuning] = StretchTuning()
+    state_space: ClassVar[ChainTuning] = ChainTuning()
     solver: SolverTuning = option(SolverTuning(), "how segments are fitted")
     importance: ImportanceTuning = option(ImportanceTuning(), "draws where the posterior is no normal")
-    state_space: ChainTuning = option(ChainTuning(), "how the searches over a chain of states go")
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ def test_the_damping_rule() -> None:
     assert rule.after(1e-2, lowered=True) == pytest.approx(2e-3)
     assert rule.after(1e-2, lowered=False) == pytest.approx(8e-2)
     assert rule.after(2e-9, lowered=True) == 1e-9
-    assert DampingRule(least_refused=1e-4).after(1e-9, lowered=False) == pytest.approx(8e-4)
+    assert rule.after(1e-9, lowered=False) == pytest.approx(8e-4)
 
 
 def test_a_search_damps_its_steps_by_the_rule() -> None:

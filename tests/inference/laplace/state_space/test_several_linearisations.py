@@ -11,6 +11,7 @@ import pytest
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.state_space import several_linearisations
+from sipe_bayes.inference.laplace.state_space.options import WideTuning
 from sipe_bayes.inference.laplace.state_space.several_linearisations import linearisations_cost, scattered
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
@@ -64,10 +65,8 @@ def test_slopes_that_jump_scatter_the_mean_and_widen_the_interval(monkeypatch: p
         return replace(linear, jump=jump)
 
     def shifts(count: int) -> ChainOptimum:
-        wide = replace(problem.options.tuning.state_space.wide, linearisations=count)
-        chain = replace(problem.options.tuning.state_space, wide=wide)
-        options = replace(problem.options, tuning=replace(problem.options.tuning, state_space=chain))
-        return scattered(replace(problem, options=options), target, optimum)
+        monkeypatch.setattr(WideTuning, "linearisations", count)
+        return scattered(problem, target, optimum)
 
     assert shifts(0) is optimum
     monkeypatch.setattr(several_linearisations, "linearise_by", torn)
