@@ -17,6 +17,12 @@ from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.contacts import may_touch
 from sipe_bayes.simulation.simulator import Simulator
 
+BoundLikelihood = Windows
+"""Logs bound to ``Segments``: simulated (``predict``, ``residuals``), linearised, and their noise and initial states
+estimated or integrated out of the linear model (``estimate_noise``, ``eliminate``, ``log_density``)."""
+BoundStates = Chain
+"""Logs bound to a ``StateSpace``."""
+
 
 @overload
 def bind(likelihood: Segments, simulator: Simulator | CallableSimulator, trajectories: Trajectories) -> Windows: ...

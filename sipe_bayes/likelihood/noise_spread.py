@@ -6,7 +6,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import Noise, coefficients
+from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.restricted import Pulls, restricted, restricted_slopes
 from sipe_bayes.likelihood.sequences import Sequence
 
@@ -68,7 +68,7 @@ def coloured_square(rows: FloatArray, sequence: Sequence, sd: float, tau: float)
 
     With V = (W' W)^-1 and W the bidiagonal whitening matrix this is Z' Z, W' Z = X, one backward recursion.
     """
-    a = coefficients(sequence.gaps, tau)[sequence.gap]
+    a = sequence.coefficients(tau)
     scale = sd * np.sqrt(1 - a**2)
     z = np.empty_like(rows)
     carried = np.zeros(rows.shape[1])

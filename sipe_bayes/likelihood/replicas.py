@@ -23,7 +23,7 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood.noise import Noise, noise_level
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.likelihood.starts.estimates import estimate_states, first_states
-from sipe_bayes.likelihood.starts.history import with_history
+from sipe_bayes.likelihood.starts.filters import with_history
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import moved

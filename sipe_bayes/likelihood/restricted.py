@@ -17,7 +17,8 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.likelihood.block_tridiagonal import Eliminated, eliminate
 from sipe_bayes.likelihood.minimise import minimise
 from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import Noise, coefficients
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.sequences import coefficients
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from sipe_bayes.calibration.readers.base import LogError
 from sipe_bayes.calibration.readers.tables import read_table
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace import Laplace
 from tests.problems.lacking import write_lacking
 from tests.problems.log_tables import EXAMPLES, FAST, QUIET, TOML, configure, load, regular, write
 

@@ -51,8 +51,7 @@ from sipe_bayes.envs.internal.closed_chains import dependent_joints
 from sipe_bayes.envs.internal.resting import resting_joints
 from sipe_bayes.envs.poses import has_pose, is_round
 from sipe_bayes.inference.recorded import Tell, silent
-from sipe_bayes.likelihood.binding import wants_state_space
-from sipe_bayes.likelihood.starts.estimates import estimate_states
+from sipe_bayes.likelihood import estimate_states, wants_state_space
 
 _PASSED = 300  # states of each log, of which it is looked what they touch
 _LOOKED_AT = 3  # logs that are simulated

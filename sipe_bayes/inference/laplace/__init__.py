@@ -64,3 +64,19 @@ fields of ``options.LaplaceTuning``, each with its reason: ``Laplace(simulator, 
   and the unknowns of a start from estimated ones, up to 16 N + 2 of chains, and some hundreds for draws where it is
   none), a finding says so.
 """
+
+from typing import TYPE_CHECKING
+
+from sipe_bayes.core.lazy import exports
+
+if TYPE_CHECKING:
+    from sipe_bayes.inference.laplace.estimator import Laplace as Laplace
+    from sipe_bayes.inference.laplace.estimator import TargetFit as TargetFit
+    from sipe_bayes.inference.laplace.estimator import noise_diagnostics as noise_diagnostics
+    from sipe_bayes.inference.laplace.estimator import target_fit as target_fit
+    from sipe_bayes.inference.laplace.estimator import target_of as target_of
+    from sipe_bayes.inference.laplace.options import LaplaceTuning as LaplaceTuning
+    from sipe_bayes.inference.laplace.options import SolverTuning as SolverTuning
+    from sipe_bayes.inference.laplace.target import Target as Target
+else:
+    __getattr__, __dir__ = exports(__name__)

@@ -21,9 +21,9 @@ from sipe_bayes.inference import importance
 from sipe_bayes.inference.importance import Draws
 from sipe_bayes.inference.laplace.optimum import WindowOptimum
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, mixture
-from sipe_bayes.inference.laplace.target import WindowFit, WindowTarget, value_cost
+from sipe_bayes.inference.laplace.target import WindowFit, WindowTarget
 from sipe_bayes.inference.stretches import Stretch, look_size, proposals, stretches
-from sipe_bayes.likelihood.settings import BudgetExhausted
+from sipe_bayes.likelihood import BudgetExhausted
 from sipe_bayes.likelihood.windows import Windows
 
 _OPEN = 0.5  # an sd, of the range, from which the slope at the optimum is nought: elsewhere it may be steep
@@ -55,7 +55,7 @@ def sharing(kept: Sequence[Optimum], problem: SearchProblem) -> list[Optimum]:
 def draw_size(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) -> int:
     """Simulations of the logs that one more batch of draws takes, with a linearisation and the optima's values."""
     values = importance.batch_size(len(problem.space), problem.options.tuning.importance) + len(sharing(kept, problem))
-    return value_cost(windows) * values + windows.num_start + 1
+    return (2 if windows.num_start else 1) * values + windows.num_start + 1
 
 
 def target_at(problem: SearchProblem, windows: Windows, optimum: Optimum) -> WindowTarget:
@@ -79,7 +79,7 @@ def probed(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) ->
         return Probe()
     sds = np.sqrt([np.diag(one.covariance) for one in shared])
     probes = len(shared) * importance.probe_size(n) if not windows.num_start or sds.max() > _OPEN else 0
-    look = value_cost(windows) * look_size(n, near=False) if len(shared) == 1 else 0
+    look = (2 if windows.num_start else 1) * look_size(n, near=False) if len(shared) == 1 else 0
     if not windows.has_room(windows.num_start + probes + look):
         return Probe(judged=False)
     target = target_at(problem, windows, best)

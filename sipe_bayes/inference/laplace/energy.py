@@ -17,7 +17,7 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, pooled
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior, free_to_move
-from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
+from sipe_bayes.likelihood.restricted import Pulls
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 
@@ -56,9 +56,7 @@ def pulls(
     """
     pull = prior.pull(theta)
     flat = FLAT_PRECISION * np.eye(len(theta))
-    start_pull = -windows.start_precision * starts
-    free = free_to_move(theta, force + pull)
-    return Pulls(prior.precision + flat, pull, windows.start_precision, start_pull, free)
+    return windows.pulls(prior.precision + flat, pull, starts, free_to_move(theta, force + pull))
 
 
 def present_noise(windows: Windows, residual: FloatArray) -> Noise:
@@ -81,18 +79,10 @@ def updated_noise(
 
     The search for it begins at ``before``; coloured: whether correlation times are estimated.
     """
-    start_pull = -windows.start_precision * starts
-    solved = eliminate_starts(moments.normal(before), moments.num_theta, windows.start_precision, start_pull)
-    context = pulls(windows, prior, theta, starts, solved.gradient)
-    noise = estimated(windows, moments, before, context, coloured)
+    solved = windows.eliminate(moments.normal(before), moments.num_theta, starts)
+    noise = windows.estimate_noise(moments, before, pulls(windows, prior, theta, starts, solved.gradient), coloured)
     sd = np.where(np.isnan(windows.fixed_sd), np.maximum(noise.sd, windows.rounding), noise.sd)
     return Noise(sd, noise.tau)
-
-
-def estimated(windows: Windows, moments: Moments, before: Noise, context: Pulls, coloured: bool) -> Noise:
-    """``likelihood.restricted.estimate_noise`` of windows."""
-    shortest, longest = float(windows.dt.min()), windows.trajectories.longest
-    return estimate_noise(moments, before, context, windows.fixed_sd, coloured, shortest, longest, windows.scales)
 
 
 def beyond_rounding(windows: Windows, noise: Noise) -> Noise:

@@ -12,12 +12,10 @@ from sipe_bayes.core.findings import Finding
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.laplace.energy import beyond_rounding, free_noise, pulls, updated_noise
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, StrategyState
-from sipe_bayes.likelihood.block_tridiagonal import Eliminated
-from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood import Eliminated, Linearisation, Moments, Noise
 from sipe_bayes.likelihood.noise_spread import noise_cloud, sandwich
-from sipe_bayes.likelihood.restricted import eliminate_starts, restricted
-from sipe_bayes.likelihood.windows import Linearisation, Windows
+from sipe_bayes.likelihood.restricted import restricted
+from sipe_bayes.likelihood.windows import Windows
 
 
 @dataclass(frozen=True)
@@ -64,9 +62,9 @@ def summarised(
 
     moments: of the linearisation ``lin`` there.
     """
-    prior, start_pull = problem.quadratic_prior, -windows.start_precision * starts
+    prior = problem.quadratic_prior
     sandwiched = windows.settings.noise == "sandwich"
-    solved = eliminate_starts(moments.normal(noise), moments.num_theta, windows.start_precision, start_pull)
+    solved = windows.eliminate(moments.normal(noise), moments.num_theta, starts)
     here = pulls(windows, prior, theta, starts, solved.gradient)
     prior_energy = prior.energy(theta) + 0.5 * float((starts**2 @ windows.start_precision).sum())
     evidence = restricted(moments, noise, replace(here, free=np.full(len(theta), True)))[0] - prior_energy
@@ -82,7 +80,7 @@ def summarised(
             centre, spread = problem.normal(theta, *_sandwiched(solved, middle, here.free))
         else:
             point = beyond_rounding(windows, point)
-            inner = eliminate_starts(moments.normal(point), moments.num_theta, windows.start_precision, start_pull)
+            inner = windows.eliminate(moments.normal(point), moments.num_theta, starts)
             centre, spread = problem.normal(theta, inner.precision, inner.gradient)
         mean += weight * centre
         covariance += weight * spread

@@ -45,7 +45,7 @@ from sipe_bayes.likelihood.settings import (
     fitted_rotations,
 )
 from sipe_bayes.likelihood.starts.estimates import estimate_states, start_sd
-from sipe_bayes.likelihood.starts.history import past_commands, with_history
+from sipe_bayes.likelihood.starts.filters import past_commands, with_history
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import moved, tangents
 

@@ -21,12 +21,7 @@ from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, follows, outli
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
-from sipe_bayes.likelihood.replicas import Replicas
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Moments, Noise, QuadraticPrior, Replicas, Segments, bind
 from sipe_bayes.posterior import GaussianMixture, prior
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.pendulums import XML, log, pendulum
