@@ -1,6 +1,8 @@
 """log p(trajectory | theta): segments of logs (multiple shooting), chains of states, their noise and their algebra.
 
-The names below are all that other rooms import from this one; each is loaded when it is first used.
+The names below are all that other rooms import from this one; each is loaded when it is first used. ``bind`` holds logs
+against a simulator by the settings of a likelihood: a ``BoundLikelihood`` simulates, linearises and compares, and
+estimates noise and initial states in the linear model. A ``FitResult`` is what a search hands over.
 """
 
 from typing import TYPE_CHECKING
@@ -12,10 +14,8 @@ if TYPE_CHECKING:
     from sipe_bayes.likelihood.binding import BoundStates as BoundStates
     from sipe_bayes.likelihood.binding import bind as bind
     from sipe_bayes.likelihood.binding import default_likelihood as default_likelihood
-    from sipe_bayes.likelihood.binding import wants_state_space as wants_state_space
     from sipe_bayes.likelihood.block_tridiagonal import Eliminated as Eliminated
     from sipe_bayes.likelihood.fit_result import FitResult as FitResult
-    from sipe_bayes.likelihood.moments import Moments as Moments
     from sipe_bayes.likelihood.noise import Noise as Noise
     from sipe_bayes.likelihood.noise import noise_level as noise_level
     from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION as FLAT_PRECISION

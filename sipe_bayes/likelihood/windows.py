@@ -499,6 +499,14 @@ class Windows:
         n = lin.jacobian.shape[-1] - self.num_start
         return Moments(lin.residual, lin.jacobian, n, self.sequences, white)
 
+    def moments_of_each(self, residuals: FloatArray, jacobian: FloatArray) -> list[Moments]:
+        """For each of residuals (W, L, C, S) its ``moments`` with a jacobian (W, L, C, N + D), formed together."""
+        n, many = jacobian.shape[-1] - self.num_start, residuals.shape[-1]
+        rows = np.concatenate([jacobian[..., :n], residuals, jacobian[..., n:]], axis=-1)
+        whole = self.moments(Linearisation(np.zeros(rows.shape[:3]), rows, True))
+        starts = n + many + np.arange(2 * self.num_start)
+        return [whole.chosen(np.concatenate([np.arange(n), starts, [n + s]]), n) for s in range(many)]
+
     def chi_square(self, residual: FloatArray, noise: Noise) -> FloatArray:
         """Whitened sum of squares (B,) of residuals (B, W, L, C)."""
         return np.asarray(sum((p**2).sum(-1) for p in self.whitened(residual, noise)))

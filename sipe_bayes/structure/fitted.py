@@ -14,8 +14,7 @@ from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.importance import ImportanceTuning
-from sipe_bayes.inference.laplace import Laplace, LaplaceTuning, SolverTuning
+from sipe_bayes.inference.laplace import EVIDENCE_TUNING, Laplace
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood import BoundLikelihood, BudgetTooSmall, FitResult, Noise, QuadraticPrior, Segments
 from sipe_bayes.posterior import GaussianMixture, Posterior
@@ -222,8 +221,6 @@ class Fitting:
     ) -> tuple[FitResult, int]:
         """The best optimum of some logs, and the rollouts that the fit took."""
         given = None if initial is None else initial[None]
-        one_noise = SolverTuning(compares=False)  # evidences of different noise do not compare
-        tuning = LaplaceTuning(solver=one_noise, importance=ImportanceTuning(wanted=False))
         laplace = Laplace(
             simulator,
             prior=prior,
@@ -232,7 +229,7 @@ class Fitting:
             likelihood=self.likelihood,
             progress=progress,
             initial=given,
-            tuning=tuning,
+            tuning=EVIDENCE_TUNING,
         )
         laplace.fit(logs)
         assert laplace.result is not None

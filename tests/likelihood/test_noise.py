@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from sipe_bayes.likelihood import Moments, Noise
+from sipe_bayes.likelihood import Noise
+from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import whiten
 from sipe_bayes.likelihood.restricted import (
     Pulls,

@@ -78,7 +78,7 @@ class Causes:
             among, beliefs = np.ix_(columns, columns), np.diag(np.concatenate([np.zeros(n), alpha[kept]]))
             covariance = np.linalg.inv(precision[among] + beliefs)
             pulls = windows.pulls(beliefs + prior[among], prior_pull[columns], logs.starts)
-            noise = windows.estimate_noise(logs.moments(columns), noise, pulls, logs.coloured)
+            noise = windows.estimate_noise(windows.moments(logs.lin(columns)), noise, pulls, logs.coloured)
             noise = Noise(np.maximum(noise.sd, windows.rounding), noise.tau)
             step = covariance @ gradient[columns]
             whole = np.zeros(logs.count)

@@ -28,7 +28,7 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.diagnostics.misfit.whitened_rows import Products, WhitenedRows
 from sipe_bayes.inference.recorded import Tell, silent
-from sipe_bayes.likelihood import BoundLikelihood, Eliminated, Linearisation, Moments, Noise, QuadraticPrior
+from sipe_bayes.likelihood import BoundLikelihood, Eliminated, Linearisation, Noise, QuadraticPrior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.probes import probes, probes_cost
@@ -222,8 +222,13 @@ class ProbedLogs:
 
     def _statistics(self, draws: FloatArray, kept: Kept) -> _Statistics:
         """Of residuals (W, L, C, S), each with the noise that is estimated in it."""
-        solved = (self.solved(draws[..., s], self.estimated(m)) for s, m in enumerate(self.together(draws)))
-        return _Statistics(np.stack([one.statistics for one in solved]))
+        windows, n, rows = self.windows, self.windows.num_theta, []
+        pulls = windows.pulls(self.inner, np.zeros(n), windows.no_starts(), self.free)
+        jacobian = np.concatenate([self.jacobian[..., :n], self.jacobian[..., self.count :]], axis=-1)
+        for s, moments in enumerate(windows.moments_of_each(draws, jacobian)):
+            noise = windows.estimate_noise(moments, self.noise, pulls, self.coloured)
+            rows.append(self.solved(draws[..., s], noise).statistics)
+        return _Statistics(np.stack(rows))
 
     def drawn(self, rng: np.random.Generator, simulated: int) -> FloatArray:
         """Residuals (W, L, C, S) of the noise alone."""
@@ -248,25 +253,11 @@ class ProbedLogs:
         nothing = (0.0,) * self.windows.num_theta
         return np.array([probe.trade or nothing for probe in self.probes]).reshape(-1, len(nothing))
 
-    def moments(self, columns: IntArray) -> Moments:
-        """Products of the logs' own residual with some columns of theta and probes, and the starts."""
+    def lin(self, columns: IntArray) -> Linearisation:
+        """The logs' own residual with some columns of theta and probes, and the starts."""
         starts = np.arange(self.count, self.jacobian.shape[-1])
         jacobian = self.jacobian[..., np.concatenate([columns, starts])]
-        return self.windows.moments(Linearisation(self.residual, jacobian, True))
-
-    def together(self, residuals: FloatArray) -> list[Moments]:
-        """For each of residuals (W, L, C, S) its products with theta and the starts."""
-        n, many = self.windows.num_theta, residuals.shape[-1]
-        rows = np.concatenate([self.jacobian[..., :n], residuals, self.jacobian[..., self.count :]], axis=-1)
-        whole = self.windows.moments(Linearisation(np.zeros(rows.shape[:3]), rows, True))
-        starts = n + many + np.arange(2 * self.windows.num_start)
-        return [whole.chosen(np.concatenate([np.arange(n), starts, [n + s]]), n) for s in range(many)]
-
-    def estimated(self, moments: Moments) -> Noise:
-        """The noise that a fit would have found in a draw of it."""
-        windows = self.windows
-        pulls = windows.pulls(self.inner, np.zeros(moments.num_theta), windows.no_starts(), self.free)
-        return windows.estimate_noise(moments, self.noise, pulls, self.coloured)
+        return Linearisation(self.residual, jacobian, True)
 
     def solved(self, residual: FloatArray, noise: Noise, pull: FloatArray | None = None) -> Solved:
         """Statistics of a residual, with what they are made of.

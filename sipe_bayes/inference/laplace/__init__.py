@@ -75,8 +75,7 @@ if TYPE_CHECKING:
     from sipe_bayes.inference.laplace.estimator import noise_diagnostics as noise_diagnostics
     from sipe_bayes.inference.laplace.estimator import target_fit as target_fit
     from sipe_bayes.inference.laplace.estimator import target_of as target_of
-    from sipe_bayes.inference.laplace.options import LaplaceTuning as LaplaceTuning
-    from sipe_bayes.inference.laplace.options import SolverTuning as SolverTuning
+    from sipe_bayes.inference.laplace.options import EVIDENCE_TUNING as EVIDENCE_TUNING
     from sipe_bayes.inference.laplace.target import Target as Target
 else:
     __getattr__, __dir__ = exports(__name__)

@@ -12,7 +12,8 @@ from sipe_bayes.core.findings import Finding
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.laplace.energy import beyond_rounding, free_noise, pulls, updated_noise
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, StrategyState
-from sipe_bayes.likelihood import Eliminated, Linearisation, Moments, Noise
+from sipe_bayes.likelihood import Eliminated, Linearisation, Noise
+from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise_spread import noise_cloud, sandwich
 from sipe_bayes.likelihood.restricted import restricted
 from sipe_bayes.likelihood.windows import Windows

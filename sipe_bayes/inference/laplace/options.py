@@ -55,6 +55,10 @@ class LaplaceTuning(Options):
     state_space: ChainTuning = option(ChainTuning(), "how the searches over a chain of states go")
 
 
+EVIDENCE_TUNING = LaplaceTuning(solver=SolverTuning(compares=False), importance=ImportanceTuning(wanted=False))
+"""Of fits whose evidences are compared: those of different noise do not compare."""
+
+
 @dataclass(frozen=True)
 class LaplaceOptions(Options):
     """What ``Laplace`` takes beside what every estimator takes."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from sipe_bayes.inference.laplace import LaplaceTuning
 from sipe_bayes.inference.laplace.levenberg_marquardt import DampingRule, QuadraticModel, descend
+from sipe_bayes.inference.laplace.options import LaplaceTuning
 
 
 @dataclass
