@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import importlib
 import sys
 from collections.abc import Callable
@@ -19,6 +18,8 @@ def exports(package: str) -> tuple[Callable[[str], object], Callable[[], list[st
     @cache
     def sources() -> dict[str, str]:
         """Name -> module that has it."""
+        import ast  # by its first use: a package's import is to be instant
+
         text = module.__loader__.get_source(package)  # type: ignore[union-attr]
         block = next(node for node in ast.parse(text).body if isinstance(node, ast.If))
         imports = (node for node in block.body if isinstance(node, ast.ImportFrom))
@@ -30,8 +31,9 @@ def exports(package: str) -> tuple[Callable[[str], object], Callable[[], list[st
         if name.startswith("_") or name not in sources():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         source = importlib.import_module(sources()[name])
-        value = getattr(source, name, None) or importlib.import_module(f"{source.__name__}.{name}")
-        setattr(module, name, value)
-        return value
+        if not hasattr(source, name):
+            importlib.import_module(f"{source.__name__}.{name}")
+        setattr(module, name, getattr(source, name))
+        return vars(module)[name]
 
     return get, lambda: [*get("__all__")]  # type: ignore[misc]

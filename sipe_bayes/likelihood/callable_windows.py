@@ -16,7 +16,7 @@ from sipe_bayes.simulation.callable_simulator import CallableSimulator
 
 
 class CallableWindows(Windows):
-    """As ``likelihood.Windows``: W observed x, L = 2 samples of which the second counts, D = 0 start unknowns."""
+    """As ``windows.Windows``: W observed x, L = 2 samples of which the second counts, D = 0 start unknowns."""
 
     has_parts: ClassVar[bool] = False  # fn is called for all x at once
 

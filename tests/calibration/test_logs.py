@@ -323,7 +323,8 @@ def test_samples_that_the_fit_left_out_are_counted_with_them(monkeypatch: pytest
         train=Trajectories.stack([trajectory]),
         environment=SimpleNamespace(channels=("q",)),
     )
-    monkeypatch.setattr(Laplace, "wild", np.array([[0, 5, 0], [0, 6, 0], [0, 7, 0]]))
+    left_out = SimpleNamespace(outliers=np.array([[0, 5, 0], [0, 6, 0], [0, 7, 0]]))
+    monkeypatch.setattr(Laplace, "result", left_out)
     (counted,) = with_wild(cast(Problem, problem), Laplace.__new__(Laplace))
     assert counted.wild == {"q": 5}
 
