@@ -48,8 +48,7 @@ from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.random_effects import random_effects
-from sipe_bayes.likelihood import Noise, QuadraticPrior, Segments, bind
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood, Noise, QuadraticPrior, Segments, bind
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.structure.extension import Placed, extended, members, placements
 from sipe_bayes.structure.machine import Machine, machine_of
@@ -78,7 +77,7 @@ def planted(
         return simulator, truth
     quiet = simulator.rollout(truth[None], command[None], simulator.default_state()[None], dt)
     seen = Trajectories.stack([Trajectory(quiet.observations[0], command, dt, channels=quiet.channels)])
-    windows = Windows(Segments(), simulator, seen)
+    windows = BoundLikelihood(Segments(), simulator, seen)
     machine = machine_of(windows, truth, windows.no_starts())
     choices = [p for p in placements(get_extension(effect), machine) if len(members(p.site)) == 1]
     one = choices[seed % len(choices)]
