@@ -29,7 +29,7 @@ from sipe_bayes.diagnostics.discovery import Discovery
 from sipe_bayes.diagnostics.evaluate import errors
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.inference.progress_bar import ProgressBar
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood
 
 FOLDER = Path(__file__).parent / "simple_pendulum"
 CONFIG, LACKING = FOLDER / "calibrate.toml", FOLDER / "discover.toml"
@@ -55,7 +55,7 @@ def published_acceleration(
     return (torque - OFFSET - friction - MASS_LENGTH * GRAVITY * np.sin(angle)) / INERTIA
 
 
-def simulate_published(windows: Windows) -> NDArray[np.float64]:
+def simulate_published(windows: BoundLikelihood) -> NDArray[np.float64]:
     """Angles (W, L) of the published model over the windows: MuJoCo has no arctangent friction, so by Runge-Kutta."""
     starts = windows.reference
     angle, rate = starts[:, 1].copy(), starts[:, 2].copy()
@@ -77,7 +77,7 @@ def simulate_published(windows: Windows) -> NDArray[np.float64]:
     return np.stack(path, axis=1)
 
 
-def published_errors(windows: Windows) -> NDArray[np.float64]:
+def published_errors(windows: BoundLikelihood) -> NDArray[np.float64]:
     """RMSE (logs,) of the published model, counted as ``errors`` counts."""
     difference = windows.measured[:, :, 0] - simulate_published(windows)
     square = np.where(windows.observed[:, :, 0], difference, 0.0) ** 2
@@ -146,7 +146,7 @@ def show_pendulum() -> None:
     problem = prepare(CONFIG)
     if problem.holdout is None:
         raise ValueError(f"{CONFIG}: no log is held out; mark one with use = 'holdout'")
-    windows = Windows(problem.likelihood, problem.simulator, problem.holdout)
+    windows = BoundLikelihood(problem.likelihood, problem.simulator, problem.holdout)
     space = problem.environment.space
     ours, weighed = errors(windows, np.stack([found.posterior.mode.numpy(), space.default_theta]))[:, :, 0]
     print("\nHeld-out error over 0.5 s windows (RMSE, rad), from the same starts")

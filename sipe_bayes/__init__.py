@@ -6,11 +6,11 @@ them as they stand; at run time each name is imported when it is first used, so 
 
 import importlib
 import sys
-from functools import cache
 from typing import TYPE_CHECKING
 
 from sipe_bayes.core import VIEWS
 from sipe_bayes.core import __version__ as __version__
+from sipe_bayes.core.lazy import exports
 
 VIEWS.update(posterior="sipe_bayes.report.posterior_plots", calibration="sipe_bayes.report.page")
 
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from sipe_bayes.inference import get_estimator as get_estimator
     from sipe_bayes.inference.progress_bar import ProgressBar as ProgressBar
     from sipe_bayes.inference.recalibrated import Recalibrated as Recalibrated
-    from sipe_bayes.likelihood.settings import Segments as Segments
-    from sipe_bayes.likelihood.settings import StateSpace as StateSpace
+    from sipe_bayes.likelihood import Segments as Segments
+    from sipe_bayes.likelihood import StateSpace as StateSpace
     from sipe_bayes.posterior import Dirac as Dirac
     from sipe_bayes.posterior import GaussianMixture as GaussianMixture
     from sipe_bayes.posterior import Particles as Particles
@@ -48,30 +48,8 @@ if TYPE_CHECKING:
     from sipe_bayes.simulation.gym import make as make
     from sipe_bayes.simulation.gym import make_vec as make_vec
     from sipe_bayes.simulation.simulator import Simulator as Simulator
-
-if not TYPE_CHECKING:
-
-    @cache
-    def _public() -> dict[str, str]:
-        """Name -> module that has it, read from the imports above."""
-        import ast
-
-        block = next(node for node in ast.parse(__loader__.get_source(__name__)).body if isinstance(node, ast.If))
-        return {alias.asname: node.module for node in block.body for alias in node.names}
-
-    def __getattr__(name):
-        if name == "__all__":
-            return ["__version__", *_public()]
-        if name.startswith("_") or name not in _public():
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        module = importlib.import_module(_public()[name])
-        if not hasattr(module, name):
-            importlib.import_module(f"{module.__name__}.{name}")
-        globals()[name] = value = getattr(module, name)
-        return value
-
-    def __dir__():
-        return sorted(__getattr__("__all__"))
+else:
+    __getattr__, __dir__ = exports(__name__)
 
 
 if "gymnasium" in sys.modules:  # its ids are wanted; importing it here would double the time of the import

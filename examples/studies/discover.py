@@ -40,8 +40,7 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood, Segments
 from sipe_bayes.structure import discover
 from sipe_bayes.structure.extension import Placed, extended, members, placements
 from sipe_bayes.structure.fitted import Fitting
@@ -160,7 +159,7 @@ def recorded(name: str, effect: str, size: float, rho: float, seed: int) -> tupl
     quiet = simulator.rollout(theta[None], actions, start, DT)
     if effect != "null":
         seen = Trajectories.stack([Trajectory(quiet.observations[0], actions[0], DT, channels=quiet.channels)])
-        windows = Windows(Segments(), simulator, seen)
+        windows = BoundLikelihood(Segments(), simulator, seen)
         machine = machine_of(windows, theta, windows.no_starts())
         choices = [p for p in placements(get_extension(effect), machine) if len(members(p.site)) == 1]
         one = choices[seed % len(choices)]

@@ -30,7 +30,7 @@ from sipe_bayes.core.files import write_text
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets import acting
 from sipe_bayes.diagnostics.scores import score
-from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood import bind
 from sipe_bayes.posterior import Dirac, Posterior, prior
 
 HERE = Path(__file__).parent

@@ -21,7 +21,7 @@ import sipe_bayes as sipe
 from sipe_bayes.calibration.problem import Problem, method_of
 from sipe_bayes.core.files import write_text
 from sipe_bayes.diagnostics.evaluate import errors
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood
 
 HERE = Path(__file__).parent
 REFERENCE = {"theta": 0.076, "alpha": 0.029}
@@ -31,7 +31,7 @@ CONFIG = HERE.parent / "furuta_pendulum" / "calibrate.toml"
 def scores(problem: Problem, theta: np.ndarray) -> dict[str, dict[str, float]]:
     """RMSE by held-out log and angle."""
     assert problem.holdout is not None
-    windows = Windows(problem.likelihood, problem.simulator, problem.holdout)
+    windows = BoundLikelihood(problem.likelihood, problem.simulator, problem.holdout)
     per_log = errors(windows, np.clip(theta, 0, 1)[None])[0]
     return {
         log: dict(zip(windows.fitted, row.round(4).tolist(), strict=True))

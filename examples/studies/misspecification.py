@@ -35,8 +35,7 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import MISFIT, ProbedLogs
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood import Noise, bind
 from sipe_bayes.structure.registry import get_extension
 
 HERE = Path(__file__).parent

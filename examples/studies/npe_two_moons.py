@@ -40,7 +40,7 @@ import sipe_bayes as sipe
 from sipe_bayes.core.files import write_text
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.inference.amortised.npe import NPE
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.models.sbi_tools import NoTracker, import_sbi, seeded
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 

@@ -23,7 +23,7 @@ from sipe_bayes.calibration.config import load_config
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.files import write_text
 from sipe_bayes.diagnostics.evaluate import errors
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood
 
 HERE = Path(__file__).parent
 CONFIG = HERE.parent / "simple_pendulum" / "calibrate.toml"
@@ -31,7 +31,7 @@ CONFIG = HERE.parent / "simple_pendulum" / "calibrate.toml"
 
 def plain_least_squares(problem: Problem, window: float | None) -> np.ndarray:
     """Theta that minimises the squared residuals of the training logs over windows from measured starts."""
-    windows = Windows(replace(problem.likelihood, window=window), problem.simulator, problem.train)
+    windows = BoundLikelihood(replace(problem.likelihood, window=window), problem.simulator, problem.train)
     scale = np.nanstd(np.where(windows.observed, windows.measured, np.nan), axis=(0, 1))
 
     def residual(theta: np.ndarray) -> np.ndarray:
@@ -45,7 +45,7 @@ def plain_least_squares(problem: Problem, window: float | None) -> np.ndarray:
 def heldout(problem: Problem, theta: np.ndarray) -> dict[str, float]:
     """RMSE in rad of the angle, by log."""
     assert problem.holdout is not None
-    windows = Windows(problem.likelihood, problem.simulator, problem.holdout)
+    windows = BoundLikelihood(problem.likelihood, problem.simulator, problem.holdout)
     return dict(zip(problem.holdout.names, errors(windows, theta[None])[0, :, 0].round(5).tolist(), strict=True))
 
 

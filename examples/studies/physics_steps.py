@@ -38,10 +38,8 @@ from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.misfit.tolerances import Tolerances
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.likelihood import Noise, QuadraticPrior, bind
 from sipe_bayes.posterior import prior
 from sipe_bayes.structure.extension import WORLD
 from sipe_bayes.structure.physics_step import PHYSICS_STEP
@@ -132,7 +130,7 @@ def one_log(name: str, timestep: float, of_machine: float, seed: int) -> Seen:
     windows, here = bind(method.likelihood, simulator, logs), posterior.mode.numpy()
     noise = Noise(*(np.array(method.diagnostics[key]) for key in ("noise_sd", "noise_tau")))
     own = QuadraticPrior.of(method.prior)
-    probed = ProbedLogs(windows, here, noise, method.fitted_starts(here), own)
+    probed = ProbedLogs(windows, here, noise, method.result.starts_at(here), own)
     looks = misfit(probed, posterior.stddev.numpy(), seed)
     known = Tolerances(physics_step=1.0)
     missing = missing_physics(probed, posterior, prior(simulator.space), looks.alarm, seed, known)

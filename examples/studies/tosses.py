@@ -26,7 +26,7 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.rotations import product, quaternions, rotation_vectors
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.simulation.simulator import Simulator
 
 RATE, SECONDS, SUBSTEPS = 120.0, 0.6, 4  # samples per second, a toss, physics steps between samples

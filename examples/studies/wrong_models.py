@@ -46,13 +46,9 @@ from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
 from sipe_bayes.diagnostics.misfit.misspecification import misfit
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.random_effects import random_effects
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
-from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood, Noise, QuadraticPrior, Segments, bind
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.structure.extension import Placed, extended, members, placements
 from sipe_bayes.structure.machine import Machine, machine_of
@@ -81,7 +77,7 @@ def planted(
         return simulator, truth
     quiet = simulator.rollout(truth[None], command[None], simulator.default_state()[None], dt)
     seen = Trajectories.stack([Trajectory(quiet.observations[0], command, dt, channels=quiet.channels)])
-    windows = Windows(Segments(), simulator, seen)
+    windows = BoundLikelihood(Segments(), simulator, seen)
     machine = machine_of(windows, truth, windows.no_starts())
     choices = [p for p in placements(get_extension(effect), machine) if len(members(p.site)) == 1]
     one = choices[seed % len(choices)]
@@ -118,7 +114,7 @@ def fitted(name: str, effect: str, seed: int, size: float) -> Iterator[dict[str,
     fit_s, theta = time.process_time() - began, posterior.mode.numpy()
     windows = bind(method.likelihood, simulator, logs)
     noise = Noise(np.array(method.diagnostics["noise_sd"]), np.array(method.diagnostics["noise_tau"]))
-    starts = method.fitted_starts(theta)
+    starts = method.result.starts_at(theta)
     assert starts is not None
     lin, parts = windows.linearise(theta, starts), parts_of(windows)
     alone = linear_estimates(windows, theta, starts, noise, lin, parts)

@@ -24,7 +24,7 @@ from sipe_bayes.core.validation import whole
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Variant
 from sipe_bayes.inference.amortised.simulations import BLOCK, Cache, Simulations
-from sipe_bayes.likelihood.starts.estimates import first_states
+from sipe_bayes.likelihood import first_states
 from sipe_bayes.posterior import prior
 from sipe_bayes.simulation.simulator import Simulator
 

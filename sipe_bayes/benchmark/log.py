@@ -23,8 +23,7 @@ from sipe_bayes.datasets.acting import Split
 from sipe_bayes.datasets.demonstrations import NoAgentWarning, demonstrations
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.task import Variant
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments, bind
 from sipe_bayes.posterior import prior
 from sipe_bayes.simulation.simulator import Simulator
 

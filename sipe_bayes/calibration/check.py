@@ -34,7 +34,7 @@ from sipe_bayes.diagnostics.coverage import FEWEST, CalibrationCheck, check_draw
 from sipe_bayes.diagnostics.sequential import clearly_wrong
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recalibrated import Recalibrated
-from sipe_bayes.likelihood.replicas import Replicas
+from sipe_bayes.likelihood import Replicas
 from sipe_bayes.report.check_plots import coverage_curve, rank_check
 from sipe_bayes.report.drawing import png
 

@@ -34,8 +34,7 @@ from sipe_bayes.diagnostics.records import Comparison, Signal
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.unknowns import bounded_by_nature
 from sipe_bayes.inference.recorded import Tell, silent
-from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood, QuadraticPrior
 from sipe_bayes.posterior import Particles
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.structure.columns import corrected
@@ -162,12 +161,14 @@ class _Model:
     tell: Tell
     extensions: Sequence[Extension] | None = None
 
-    def windows(self, logs: Trajectories, like: Windows | None = None) -> Windows:
+    def windows(self, logs: Trajectories, like: BoundLikelihood | None = None) -> BoundLikelihood:
         """By which logs are scored and drawn, their columns multiplied as those of the fits were."""
         logs = corrected(logs, self.structures.columns, self.problem.environment.actuators)
-        return Windows(replace(self.problem.segments, fit=None), self.structures.simulator(self.one), logs, like)
+        return BoundLikelihood(
+            replace(self.problem.segments, fit=None), self.structures.simulator(self.one), logs, like
+        )
 
-    def predicted(self, windows: Windows) -> FloatArray:
+    def predicted(self, windows: BoundLikelihood) -> FloatArray:
         """Predictions (W, L, C) from measured starts."""
         theta = self.one.theta[None]
         return windows.predict(theta, measured_starts(windows, theta))[0][0]

@@ -23,10 +23,14 @@ from sipe_bayes.diagnostics.records import ChannelScore, LogReport, Ridge, impro
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.poses import has_pose
-from sipe_bayes.likelihood.quadratic_prior import UNIFORM_PRECISION
-from sipe_bayes.likelihood.settings import Segments, StateSpace
-from sipe_bayes.likelihood.starts.estimates import tied_joints, unmeasured_joints
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import (
+    UNIFORM_PRECISION,
+    BoundLikelihood,
+    Segments,
+    StateSpace,
+    tied_joints,
+    unmeasured_joints,
+)
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.simulation.simulator import Simulator
 
@@ -272,7 +276,7 @@ def not_better(scores: Sequence[ChannelScore]) -> list[Finding]:
     return noticed
 
 
-def worse_in_training(windows: Windows, theta: FloatArray, scores: Sequence[ChannelScore]) -> list[Finding]:
+def worse_in_training(windows: BoundLikelihood, theta: FloatArray, scores: Sequence[ChannelScore]) -> list[Finding]:
     """Where theta (N,) follows the logs that it was fitted to worse than the model as given does.
 
     From measured starts, and if it is worse from these, from those that each model fits best. scores: of these logs.

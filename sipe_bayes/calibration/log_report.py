@@ -14,8 +14,8 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectory
+from sipe_bayes.core.wild_samples import AFTER, jumps
 from sipe_bayes.diagnostics.records import LogReport
-from sipe_bayes.likelihood.wild_samples import AFTER, jumps
 
 _EVEN, _FEWEST = 0.95, 10  # share of a slower sensor's samples that are as far apart as usual; and how many it has
 _ROUNDED = 1e-6  # of a period: less is how times near zero are rounded

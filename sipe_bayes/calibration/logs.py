@@ -43,8 +43,8 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.rotations import aligned, continued, rotation_vectors
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.core.units import convert
+from sipe_bayes.core.wild_samples import wild_positions
 from sipe_bayes.diagnostics.records import LogReport
-from sipe_bayes.likelihood.wild_samples import wild_positions
 from sipe_bayes.simulation.engine import HUGE
 
 _SLOW = 0.25  # s from row to row: no robot is logged so slowly without its being meant

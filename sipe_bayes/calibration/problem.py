@@ -35,7 +35,7 @@ from sipe_bayes.inference import get_estimator
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.inference.registry import estimator_class
-from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.likelihood import Segments, StateSpace
 from sipe_bayes.posterior import GaussianMixture, Posterior, load_posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator

@@ -49,9 +49,7 @@ from sipe_bayes.envs.unknowns import bounded_by_nature
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Progress, digest
 from sipe_bayes.inference.registry import estimator_class
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.settings import StateSpace
-from sipe_bayes.likelihood.state_space.process_noise import process_noise_findings
+from sipe_bayes.likelihood import StateSpace, bind, process_noise_findings
 from sipe_bayes.posterior import Particles
 
 S = TypeVar("S")

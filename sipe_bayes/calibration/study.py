@@ -20,8 +20,7 @@ from sipe_bayes.inference.log_noise import fitted_noise
 from sipe_bayes.inference.recalibrated import Recalibrated
 from sipe_bayes.inference.recorded import digest
 from sipe_bayes.inference.registry import estimator_class
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.likelihood import Noise, Segments, StateSpace
 from sipe_bayes.simulation.simulator import Simulator
 
 _VERSION = 2  # of what a fit's file holds: each fit has a seed of its own

@@ -14,7 +14,7 @@ from sipe_bayes.core.validation import positive, whole
 if TYPE_CHECKING:
     from sipe_bayes.calibration.problem import Problem
     from sipe_bayes.diagnostics.expected import Plan
-    from sipe_bayes.likelihood.noise import Noise
+    from sipe_bayes.likelihood import Noise
     from sipe_bayes.posterior import Posterior
 
 _SHOWN = 10
@@ -122,7 +122,7 @@ def _noise(problem: Problem, path: Path | None) -> Noise:
 
     from sipe_bayes.core.files import read_json, reading
     from sipe_bayes.inference.log_noise import fitted_noise
-    from sipe_bayes.likelihood.noise import Noise
+    from sipe_bayes.likelihood import Noise
 
     channels = list(problem.simulator.environment.channels)
     fitted = list(problem.segments.fit or channels)

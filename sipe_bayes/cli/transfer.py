@@ -8,17 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sipe_bayes.cli.errors import check_least, exit_on_error
-from sipe_bayes.cli.studies import (
-    Address,
-    Jobs,
-    Out,
-    Retry,
-    Where,
-    add_status_and_cells,
-    chosen,
-    executor_of,
-    measure,
-)
+from sipe_bayes.cli.studies import Address, Jobs, Out, Retry, Where, add_status_and_cells, chosen, executor_of, measure
 
 if TYPE_CHECKING:
     from sipe_bayes.benchmark.studies import Study

@@ -191,6 +191,12 @@ class Trajectories(Sequence[Trajectory]):
         """Seconds of the longest; of the correlation times of its noise, the longest that can be told."""
         return float((self.length * self.dt).max())
 
+    @property
+    def states_throughout(self) -> bool:
+        """Whether the state of every sample is recorded, and not of none or the first alone."""
+        states = self.states
+        return states is not None and int(np.isfinite(states[..., 0]).sum()) == int((self.length + 1).sum())
+
     def __len__(self) -> int:
         return len(self.actions)
 

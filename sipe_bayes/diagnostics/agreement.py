@@ -30,14 +30,10 @@ from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.random_effects import LogEstimate
 from sipe_bayes.inference.recorded import Tell, silent
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.quadratic_prior import UNIFORM_PRECISION
-from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
-from sipe_bayes.likelihood.settings import Segments, StateSpace
-from sipe_bayes.likelihood.windows import Linearisation, Windows
+from sipe_bayes.likelihood import UNIFORM_PRECISION, BoundLikelihood, Linearisation, Noise, Segments, StateSpace
 from sipe_bayes.simulation.simulator import Simulator
 
 LOG_BUDGET = 5000  # rollouts for each log
@@ -100,7 +96,7 @@ class Disagreement:
         return self.finding.text
 
 
-def parts_of(windows: Windows) -> list[tuple[str, IntArray]]:
+def parts_of(windows: BoundLikelihood) -> list[tuple[str, IntArray]]:
     """Each log's name and windows; of a single one pieces that stand for several, of whole windows."""
     logs = windows.trajectories
     if len(logs) > 1:
@@ -173,7 +169,7 @@ def _alone(method: Laplace, log: Trajectory, kept: Kept) -> _Alone:
 
 
 def linear_estimates(
-    windows: Windows,
+    windows: BoundLikelihood,
     theta: FloatArray,
     starts: FloatArray,
     noise: Noise,
@@ -195,17 +191,15 @@ def linear_estimates(
     Returns:
         One for each part.
     """
-    logs, n, estimates = windows.trajectories, len(theta), []
+    n, estimates, precision = len(theta), [], windows.start_precision
     for name, mine in parts:
-        part, pull = windows.part(mine), -windows.start_precision * starts[mine]
-        moments = part.moments(Linearisation(lin.residual[mine], lin.jacobian[mine], True))
-        pulls = Pulls(_FLAT * np.eye(n), np.zeros(n), windows.start_precision, pull, np.ones(n, bool))
-        span = float(part.dt.min()), logs.longest
-        coloured = bool((noise.tau > 0).any())
-        own = estimate_noise(moments, noise, pulls, windows.fixed_sd, coloured, *span, windows.scales)
+        part = windows.part(mine)
+        part.start_precision = precision  # of all logs together
+        moments, pulls = part.moments(lin.part(mine)), part.pulls(_FLAT * np.eye(n), np.zeros(n), starts[mine])
+        own = part.estimate_noise(moments, noise, pulls, bool((noise.tau > 0).any()))
         sd = np.maximum(own.sd, windows.rounding)
         own = Noise(sd if memory is None else sd * np.sqrt(memory), own.tau)
-        solved = eliminate_starts(moments.normal(own), n, windows.start_precision, pull)
+        solved = part.eliminate(moments.normal(own), n, starts[mine])
         step = np.linalg.pinv(solved.precision, rcond=1e-12, hermitian=True) @ solved.gradient
         estimates.append(LogEstimate(name, theta + step, solved.precision))
     return estimates

@@ -28,7 +28,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.evaluate import fitted_units, posterior_band
 from sipe_bayes.diagnostics.records import BandCoverage
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood
 from sipe_bayes.posterior import Posterior
 
 PIECES = 10  # of a log: errors of neighbouring samples are not independent, of tenths nearly so
@@ -45,7 +45,7 @@ class Bands:
     margin: FloatArray
 
     @classmethod
-    def of(cls, windows: Windows, predicted: FloatArray, low: FloatArray, high: FloatArray) -> Bands:
+    def of(cls, windows: BoundLikelihood, predicted: FloatArray, low: FloatArray, high: FloatArray) -> Bands:
         """From training logs.
 
         Args:
@@ -70,7 +70,7 @@ class Bands:
 
 
 def predictive_bands(
-    windows: Mapping[str, Windows],
+    windows: Mapping[str, BoundLikelihood],
     predicted: Mapping[str, FloatArray],
     theta: FloatArray,
     posterior: Posterior,
@@ -98,7 +98,7 @@ def predictive_bands(
     return {use: bands.widen(*band) for use, band in narrow.items()}
 
 
-def band_coverage(windows: Windows, low: FloatArray, high: FloatArray) -> BandCoverage | None:
+def band_coverage(windows: BoundLikelihood, low: FloatArray, high: FloatArray) -> BandCoverage | None:
     """How much of logs their bands (W, L, C) hold; None where nothing was measured."""
     shares, halves = [], {}
     for c, (channel, unit) in enumerate(zip(windows.fitted, fitted_units(windows), strict=True)):
@@ -114,7 +114,7 @@ def band_coverage(windows: Windows, low: FloatArray, high: FloatArray) -> BandCo
     return BandCoverage(float(every.mean()), float(every.std() / np.sqrt(len(every))), len(every), halves)
 
 
-def _growth(windows: Windows, predicted: FloatArray) -> FloatArray:
+def _growth(windows: BoundLikelihood, predicted: FloatArray) -> FloatArray:
     """Root-mean-square errors (L, C) by samples since a window began, which do not fall."""
     square = np.where(windows.observed, (windows.measured - predicted) ** 2, 0.0)
     square = np.where(np.isfinite(square), square, 0.0).sum(0)
@@ -129,7 +129,7 @@ def _growth(windows: Windows, predicted: FloatArray) -> FloatArray:
     return out
 
 
-def _pieces(windows: Windows, channel: int) -> list[BoolArray]:
+def _pieces(windows: BoundLikelihood, channel: int) -> list[BoolArray]:
     """Masks (W, L) of a channel's samples: tenths of each log."""
     masks = []
     for k in range(len(windows.trajectories)):

@@ -18,11 +18,8 @@ import torch
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Residual, Signal
-from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.envs.poses import inertial_joints
-from sipe_bayes.likelihood.noise import Noise, whiten
-from sipe_bayes.likelihood.restricted import marginal
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood, Noise
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.simulation.simulator import Simulator
 
@@ -37,7 +34,7 @@ _AT_LIMIT = 1e-3  # relative: so near to it a correlation time is the longest th
 _PIECES = 10  # of a log: errors of neighbouring samples are not independent, of tenths nearly so
 
 
-def errors(windows: Windows, theta: FloatArray) -> FloatArray:
+def errors(windows: BoundLikelihood, theta: FloatArray) -> FloatArray:
     """RMSE (B, logs, C) of theta (B, N) over the windows of each log from measured starts.
 
     Infinite where one of the log's windows diverges, NaN where a channel has no sample.
@@ -45,12 +42,12 @@ def errors(windows: Windows, theta: FloatArray) -> FloatArray:
     return _roots(windows, _squares(windows, theta))
 
 
-def errors_from_best_starts(windows: Windows, theta: FloatArray) -> FloatArray:
+def errors_from_best_starts(windows: BoundLikelihood, theta: FloatArray) -> FloatArray:
     """As ``errors`` of one theta (N,), from the starts that it fits best: (logs, C)."""
     return np.asarray(_roots(windows, _best_squares(windows, theta)[None])[0])
 
 
-def _roots(windows: Windows, square: FloatArray) -> FloatArray:
+def _roots(windows: BoundLikelihood, square: FloatArray) -> FloatArray:
     """RMSE (B, logs, C) of squared errors (B, W, L, C)."""
     out = np.full((len(square), len(windows.trajectories), len(windows.channels)), np.nan)
     for k in range(len(windows.trajectories)):
@@ -62,26 +59,26 @@ def _roots(windows: Windows, square: FloatArray) -> FloatArray:
     return out
 
 
-def _squares(windows: Windows, theta: FloatArray) -> FloatArray:
+def _squares(windows: BoundLikelihood, theta: FloatArray) -> FloatArray:
     """Squared errors (B, W, L, C) of theta (B, N) from measured starts, zero where nothing was measured."""
     return _off(windows, windows.predict(theta, measured_starts(windows, theta))[0])
 
 
-def _off(windows: Windows, predicted: FloatArray) -> FloatArray:
+def _off(windows: BoundLikelihood, predicted: FloatArray) -> FloatArray:
     """Squared errors (B, W, L, C) of predictions, zero where nothing was measured."""
     return np.where(windows.observed, (windows.measured - predicted) ** 2, 0.0)
 
 
-def both_predicted(windows: Windows, theta: FloatArray) -> FloatArray:
+def both_predicted(windows: BoundLikelihood, theta: FloatArray) -> FloatArray:
     """Predictions (2, W, L, C) from measured starts: of theta (N,) and of the model as given."""
     thetas = np.stack([theta, np.clip(windows.simulator.space.default_theta, 0, 1)])
     return windows.predict(thetas, measured_starts(windows, thetas))[0]
 
 
 def compare_errors(
-    windows: Windows,
+    windows: BoundLikelihood,
     theta: FloatArray,
-    reference: tuple[Windows, FloatArray] | None = None,
+    reference: tuple[BoundLikelihood, FloatArray] | None = None,
     fit_starts: bool = False,
     predicted: FloatArray | None = None,
 ) -> Comparison | None:
@@ -110,7 +107,7 @@ def compare_errors(
         square = np.concatenate([_squares(windows, theta[None]), _squares(others, at[None])])
     else:
         square = _off(windows, predicted)
-    some = spread_windows(windows, LOOKED_AT, every_log=True)
+    some = windows.spread_over(LOOKED_AT, every_log=True)
     share = _share_of_starts(windows, square[0][some], _best_squares(windows.part(some), theta))
     by_starts = share > THRESHOLDS.starts_rule
     if by_starts or fit_starts:
@@ -131,19 +128,19 @@ def compare_errors(
     return replace(_jackknifed(parts), starts=share if by_starts else None)
 
 
-def _best_squares(windows: Windows, theta: FloatArray) -> FloatArray:
+def _best_squares(windows: BoundLikelihood, theta: FloatArray) -> FloatArray:
     """As ``_squares`` of one theta (N,), from the starts that fit best: (W, L, C)."""
     residual, valid = _best_residuals(windows, theta)
     return np.where(windows.observed, residual**2 if valid else np.inf, 0.0)
 
 
-def _best_residuals(windows: Windows, theta: FloatArray) -> tuple[FloatArray, bool]:
+def _best_residuals(windows: BoundLikelihood, theta: FloatArray) -> tuple[FloatArray, bool]:
     """Residuals (W, L, C) of theta (N,) from the starts that fit best, and whether the simulation is valid."""
     noise = Noise(np.maximum(0.05 * np.nan_to_num(windows.spread), windows.rounding), np.zeros(len(windows.fitted)))
     return _from_best_starts(windows, theta, noise)[1:]
 
 
-def _share_of_starts(windows: Windows, square: FloatArray, fitted: FloatArray) -> float:
+def _share_of_starts(windows: BoundLikelihood, square: FloatArray, fitted: FloatArray) -> float:
     """How much smaller squared errors (W, L, C) are from fitted starts; 0 where either is infinite.
 
     They are in units of each channel's spread.
@@ -176,20 +173,22 @@ def _jackknifed(parts: list[FloatArray]) -> Comparison:
     return Comparison(float(np.exp(mean)), float(np.exp(mean - margin)), float(np.exp(mean + margin)), p, pieces)
 
 
-def fitted_units(windows: Windows) -> list[str]:
+def fitted_units(windows: BoundLikelihood) -> list[str]:
     """The units of the fitted channels, empty where the environment tells none."""
     units = getattr(windows.simulator.environment, "channel_units", None)
     return ["" if units is None else units[c] for c in windows.channels]
 
 
-def channel_noise(windows: Windows, noise: Noise) -> dict[str, ChannelNoise]:
+def channel_noise(windows: BoundLikelihood, noise: Noise) -> dict[str, ChannelNoise]:
     """The noise of each fitted channel."""
     at_limit = noise.tau >= (1 - _AT_LIMIT) * windows.trajectories.longest
     rows = zip(noise.sd.tolist(), noise.tau.tolist(), fitted_units(windows), at_limit.tolist(), strict=True)
     return {channel: ChannelNoise(*row) for channel, row in zip(windows.fitted, rows, strict=True)}
 
 
-def channel_scores(windows: Windows, theta: FloatArray, predicted: FloatArray | None = None) -> list[ChannelScore]:
+def channel_scores(
+    windows: BoundLikelihood, theta: FloatArray, predicted: FloatArray | None = None
+) -> list[ChannelScore]:
     """One row for each log and channel, theta (N,) beside the model as given; predicted: by ``both_predicted``."""
     predicted = both_predicted(windows, theta) if predicted is None else predicted
     rmse = _roots(windows, _off(windows, predicted))
@@ -201,7 +200,7 @@ def channel_scores(windows: Windows, theta: FloatArray, predicted: FloatArray | 
     ]
 
 
-def _stitched(windows: Windows, predicted: FloatArray, log: int) -> FloatArray:
+def _stitched(windows: BoundLikelihood, predicted: FloatArray, log: int) -> FloatArray:
     """Predictions (B, T+1, C) of one log, of predicted (B, W, L, C); NaN where no window stands."""
     out = np.full((len(predicted), len(windows.trajectories[log].time), predicted.shape[-1]), np.nan)
     for w in np.flatnonzero(windows.log == log):
@@ -210,7 +209,9 @@ def _stitched(windows: Windows, predicted: FloatArray, log: int) -> FloatArray:
     return out
 
 
-def signals(windows: Windows, use: str, predicted: FloatArray, band: tuple[FloatArray, FloatArray]) -> list[Signal]:
+def signals(
+    windows: BoundLikelihood, use: str, predicted: FloatArray, band: tuple[FloatArray, FloatArray]
+) -> list[Signal]:
     """What the report draws of each log and channel.
 
     Args:
@@ -232,7 +233,7 @@ def signals(windows: Windows, use: str, predicted: FloatArray, band: tuple[Float
 
 
 def posterior_band(
-    windows: Windows, theta: FloatArray, posterior: Posterior, seed: int, here: FloatArray
+    windows: BoundLikelihood, theta: FloatArray, posterior: Posterior, seed: int, here: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """5 and 95 % quantiles (W, L, C) of predictions over a posterior, to first order where it is narrow.
 
@@ -254,7 +255,7 @@ def posterior_band(
     return low, high
 
 
-def _band(windows: Windows, theta: FloatArray, draws: FloatArray, here: FloatArray) -> FloatArray:
+def _band(windows: BoundLikelihood, theta: FloatArray, draws: FloatArray, here: FloatArray) -> FloatArray:
     """Predictions (B, W, L, C) of draws (B, N) about theta (N,), where they are those ``here`` (W, L, C).
 
     Of a narrow posterior of few parameters by differences over an sd of each, else of fewer draws.
@@ -269,14 +270,14 @@ def _band(windows: Windows, theta: FloatArray, draws: FloatArray, here: FloatArr
     return np.asarray(here + np.tensordot(draws - theta, slopes, axes=1))
 
 
-def white_noise(windows: Windows, theta: FloatArray) -> Noise:
+def white_noise(windows: BoundLikelihood, theta: FloatArray) -> Noise:
     """White noise of the size of the residuals at theta (N,), with the windows' starts at their best."""
     squares = (_best_residuals(windows, theta)[0] ** 2).sum(axis=(0, 1))
     size = np.sqrt(squares / np.maximum(windows.observed.sum(axis=(0, 1)), 1))
     return Noise(np.maximum(size, windows.rounding), np.zeros(len(size)))
 
 
-def fitted_residuals(windows: Windows, theta: FloatArray, noise: Noise, starts: FloatArray) -> list[Residual]:
+def fitted_residuals(windows: BoundLikelihood, theta: FloatArray, noise: Noise, starts: FloatArray) -> list[Residual]:
     """Residuals of each log and channel.
 
     Args:
@@ -287,9 +288,9 @@ def fitted_residuals(windows: Windows, theta: FloatArray, noise: Noise, starts: 
     """
     residual = windows.residuals(theta[None], starts[None])[0][0]
     white = np.full(residual.shape, np.nan)
-    for c, s in enumerate(windows.sequences):
+    for c, own in enumerate(windows.whitened(residual[None], noise)):
         flat = white[:, :, c].reshape(-1)
-        flat[s.index] = whiten(residual[:, :, c].reshape(-1), s, float(noise.sd[c]), float(noise.tau[c]))
+        flat[windows.sequences[c].index] = own[0]
         white[:, :, c] = flat.reshape(residual.shape[:2])
     shown = np.where(windows.observed, residual, np.nan)
     out = []
@@ -300,18 +301,18 @@ def fitted_residuals(windows: Windows, theta: FloatArray, noise: Noise, starts: 
     return out
 
 
-def starts_cost(windows: Windows) -> int:
+def starts_cost(windows: BoundLikelihood) -> int:
     """Rollouts of ``best_starts`` at most."""
     each = windows.num_start + len(_SHORTER)
     return (1 + _ITERATIONS * each) * len(windows.trajectories)
 
 
-def band_cost(windows: Windows) -> int:
+def band_cost(windows: BoundLikelihood) -> int:
     """Rollouts of ``posterior_band`` at most."""
     return _FEW_DRAWS * len(windows.trajectories)
 
 
-def measured_starts(windows: Windows, theta: FloatArray, near: FloatArray | None = None) -> FloatArray:
+def measured_starts(windows: BoundLikelihood, theta: FloatArray, near: FloatArray | None = None) -> FloatArray:
     """Initial states (B, W, D) of theta (B, N) for free simulations: zero is what was measured.
 
     Of free bodies that strike something the first tenth of a second tells far more than its smoothed first sample:
@@ -327,12 +328,12 @@ def measured_starts(windows: Windows, theta: FloatArray, near: FloatArray | None
     return np.broadcast_to(np.stack(own), (len(theta), *own[0].shape))
 
 
-def best_starts(windows: Windows, theta: FloatArray, noise: Noise) -> FloatArray:
+def best_starts(windows: BoundLikelihood, theta: FloatArray, noise: Noise) -> FloatArray:
     """Starts (W, D) that minimise the whitened residuals at a fixed theta (N,)."""
     return _from_best_starts(windows, theta, noise)[0]
 
 
-def _from_best_starts(windows: Windows, theta: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray, bool]:
+def _from_best_starts(windows: BoundLikelihood, theta: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray, bool]:
     """The best starts (W, D), the residuals (W, L, C) from them, and whether that simulation is valid."""
 
     def simulated(starts: FloatArray) -> tuple[FloatArray, bool]:
@@ -343,7 +344,7 @@ def _from_best_starts(windows: Windows, theta: FloatArray, noise: Noise) -> tupl
     residual, valid = simulated(starts)
     for _ in range(_ITERATIONS if valid and np.isfinite(residual).all() else 0):
         linearisation = windows.linearise(theta, starts, with_theta=False, residual=residual)
-        move = marginal(windows.moments(linearisation), noise, starts, windows.start_precision)[1]
+        move = windows.log_density(windows.moments(linearisation), noise, starts)[1]
         before = after = windows.chi_square(residual[None], noise)[0]
         for share in _SHORTER:
             tried, good = simulated(starts + share * move)

@@ -35,11 +35,7 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.identifiability import ridges
 from sipe_bayes.diagnostics.records import Ridge
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, UNIFORM_PRECISION
-from sipe_bayes.likelihood.restricted import eliminate_starts
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import FLAT_PRECISION, UNIFORM_PRECISION, Noise, Segments, bind
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.simulation.simulator import Simulator
 
@@ -128,8 +124,7 @@ def information(
     if not linearisation.valid:
         return None
     normal = windows.moments(linearisation).normal(noise)
-    solved = eliminate_starts(normal, windows.num_theta, windows.start_precision, windows.no_starts())
-    return _of_shared(solved.precision, simulator.space)
+    return _of_shared(windows.eliminate(normal, windows.num_theta).precision, simulator.space)
 
 
 def _of_shared(plain: FloatArray, space: ParameterSpace) -> FloatArray:

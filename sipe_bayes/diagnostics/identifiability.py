@@ -17,15 +17,14 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import Ridge
-from sipe_bayes.diagnostics.thinning import spread_windows
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood
 
 GRID = (0.0, 0.25, 0.5, 0.75, 1.0)  # of theta, where parameters are tried
 _SEVERAL = 2  # parameters that a measured value has to tell beside itself
 _LOOKED_AT = 400  # control steps: what does something there is not asked again of all windows
 
 
-def dead_ranges(windows: Windows, theta: FloatArray) -> dict[str, list[tuple[float, float]]]:
+def dead_ranges(windows: BoundLikelihood, theta: FloatArray) -> dict[str, list[tuple[float, float]]]:
     """Where parameters change nothing; costs five rollouts a parameter and log, or of many windows those of some.
 
     Args:
@@ -37,13 +36,13 @@ def dead_ranges(windows: Windows, theta: FloatArray) -> dict[str, list[tuple[flo
         is not called dead.
     """
     names = list(windows.simulator.space.names)
-    some = spread_windows(windows, _LOOKED_AT)
+    some = windows.spread_over(_LOOKED_AT)
     if len(some) < windows.num_windows:
         names = list(_dead(windows.part(some), theta, names))
     return _dead(windows, theta, names)
 
 
-def _dead(windows: Windows, theta: FloatArray, names: Sequence[str]) -> dict[str, list[tuple[float, float]]]:
+def _dead(windows: BoundLikelihood, theta: FloatArray, names: Sequence[str]) -> dict[str, list[tuple[float, float]]]:
     """``dead_ranges`` of some parameters."""
     dead: dict[str, list[tuple[float, float]]] = {}
     scale = np.maximum(windows.spread, 1e-12)

@@ -19,10 +19,7 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.rotations import written_near
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.thinning import spread_windows
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.replicas import Replicas
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood, Noise, Replicas
 from sipe_bayes.posterior import Posterior
 
 
@@ -87,7 +84,7 @@ class OutsidePrior:
 
 
 def outside_prior(
-    windows: Windows, prior: Posterior, noise: Noise, *, seed: int = 0, followed: bool = False
+    windows: BoundLikelihood, prior: Posterior, noise: Noise, *, seed: int = 0, followed: bool = False
 ) -> list[OutsidePrior]:
     """For each log its place among simulations of the prior; those that diverge are left out.
 
@@ -107,7 +104,7 @@ def outside_prior(
     Raises:
         ValueError: where more than half of the simulations diverge.
     """
-    chosen = spread_windows(windows, PREDICTIVE.steps, every_log=True)
+    chosen = windows.spread_over(PREDICTIVE.steps, every_log=True)
     logs = Trajectories.stack([_piece(windows, int(w)) for w in chosen])
     made = _predictive(windows, logs, prior, noise, seed)
     if len(made) < PREDICTIVE.simulations // 2:
@@ -142,7 +139,7 @@ def outside_prior(
     return outcome
 
 
-def follows(windows: Windows, predicted: FloatArray) -> bool:
+def follows(windows: BoundLikelihood, predicted: FloatArray) -> bool:
     """Whether simulations bend as the logs do, in every channel: with a wrong unit or sign they do not.
 
     What a straight line in time leaves of the median window is compared with what it leaves of the difference: a start
@@ -171,7 +168,7 @@ def follows(windows: Windows, predicted: FloatArray) -> bool:
     return True
 
 
-def _piece(windows: Windows, number: int) -> Trajectory:
+def _piece(windows: BoundLikelihood, number: int) -> Trajectory:
     """A window as a log of its own."""
     log, start = int(windows.log[number]), int(windows.start[number])
     whole, stop = windows.trajectories[log], start + int(windows.steps[number])
@@ -180,7 +177,9 @@ def _piece(windows: Windows, number: int) -> Trajectory:
     return Trajectory(observations, actions, whole.dt, states, whole.name, whole.channels)
 
 
-def _predictive(windows: Windows, logs: Trajectories, prior: Posterior, noise: Noise, seed: int) -> list[FloatArray]:
+def _predictive(
+    windows: BoundLikelihood, logs: Trajectories, prior: Posterior, noise: Noise, seed: int
+) -> list[FloatArray]:
     """Observations (R, T+1, O) of the logs at draws of the prior, orientations written near the logs' own."""
     replicas, rng = Replicas(windows.simulator, logs, noise), np.random.default_rng(seed)
     thetas = prior.sample((PREDICTIVE.simulations,), generator=torch.Generator().manual_seed(seed)).numpy()

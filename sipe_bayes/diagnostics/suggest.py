@@ -28,8 +28,7 @@ import torch
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.diagnostics.expected import Plan, contraction, informations, knowledge
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Noise, Segments
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.simulation.simulator import Simulator
 

@@ -17,27 +17,24 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, cast
 
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import SearchState, Snapshot, Stored, load_state
 from sipe_bayes.core.findings import Code, Findings, finding
 from sipe_bayes.core.options import Options
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import MOST_ROLLOUTS, flag, path, whole
-from sipe_bayes.datasets.demonstrations import Given
-from sipe_bayes.inference.arguments import check_comparison, check_named, check_simulator, stated_prior
-from sipe_bayes.inference.device_findings import device_findings, differentiable
 from sipe_bayes.inference.recorded import Progress, Recorded, at_bounds, digest, silent
-from sipe_bayes.likelihood.binding import bind, default_likelihood
-from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, Segments, StateSpace
-from sipe_bayes.likelihood.state_space.chain import Chain
-from sipe_bayes.likelihood.windows import Windows
-from sipe_bayes.posterior import Posterior
-from sipe_bayes.simulation.callable_simulator import CallableSimulator
-from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall
+
+if TYPE_CHECKING:
+    from sipe_bayes.likelihood import BoundLikelihood, BoundStates, FitResult, Segments, StateSpace
+    from sipe_bayes.posterior import Posterior
+    from sipe_bayes.simulation.callable_simulator import CallableSimulator
+    from sipe_bayes.simulation.simulator import Simulator
 
 S = TypeVar("S", bound=SearchState)
 
@@ -75,7 +72,7 @@ class Estimator(ABC, Generic[S]):
         from sipe_bayes.core.options import Options, option
         from sipe_bayes.core.seeding import torch_generator
         from sipe_bayes.inference.base import Estimator
-        from sipe_bayes.likelihood.discrepancy import StateDifference, channel_scale, simulate
+        from sipe_bayes.inference.search.discrepancy import StateDifference, channel_scale
         from sipe_bayes.posterior import Dirac
 
         @dataclass(frozen=True)
@@ -101,7 +98,7 @@ class Estimator(ABC, Generic[S]):
                 generator = torch_generator([self.seed, len(state.theta)])  # other draws with every seed
                 theta = self.prior.sample((self.options.batch,), generator=generator).numpy()
                 windows = self.windows(trajectories)
-                predicted = simulate(windows, theta)  # raises BudgetExhausted
+                predicted = windows.simulate(theta)  # raises BudgetExhausted
                 cost = StateDifference(windows, channel_scale(windows, predicted))(predicted)
                 return replace(
                     state, theta=np.concatenate([state.theta, theta]), cost=np.concatenate([state.cost, cost])
@@ -149,6 +146,10 @@ class Estimator(ABC, Generic[S]):
         progress: Progress | None = None,
         **options: object,
     ) -> None:
+        from sipe_bayes.datasets.demonstrations import Given
+        from sipe_bayes.inference.arguments import check_comparison, check_simulator, differentiable, stated_prior
+        from sipe_bayes.likelihood import default_likelihood
+
         self.options = self.options_type.of(options, self.name)
         check_simulator(simulator)
         self.simulator, self.space = differentiable(simulator) if self.searches else simulator, simulator.space
@@ -166,7 +167,7 @@ class Estimator(ABC, Generic[S]):
         self.announce: Callable[[str], None] = silent  # gets a first estimate in words, as soon as there is one
         self._last: Snapshot[S] | None = None
         self._run = ""  # fingerprint of the run that it belongs to
-        self._bound: tuple[Trajectories, Windows | Chain] | None = None
+        self._bound: tuple[Trajectories, BoundLikelihood | BoundStates] | None = None
         self._given = Given()
         self._observed: Trajectory | None = None
         self.prepare()
@@ -180,6 +181,8 @@ class Estimator(ABC, Generic[S]):
 
     def stored(self, name: str, given: object) -> Path | None:
         """The path that an argument gives; raises ValueError for a simulator that others there cannot be told from."""
+        from sipe_bayes.inference.arguments import check_named
+
         check_named(self.simulator, name, given)
         return path(name, given)
 
@@ -280,6 +283,8 @@ class Estimator(ABC, Generic[S]):
 
     def choose_likelihood(self, batch: Trajectories) -> None:
         """The likelihood that suits the logs, where none was given."""
+        from sipe_bayes.likelihood import default_likelihood
+
         if self._own_likelihood:
             self.likelihood = default_likelihood(self.simulator, batch)
 
@@ -298,6 +303,8 @@ class Estimator(ABC, Generic[S]):
 
     def _finished(self, state: S, trajectories: Trajectories) -> Posterior:
         """The posterior, after a look at its bounds: a truth outside the prior must raise suspicion, not confidence."""
+        from sipe_bayes.inference.arguments import device_findings
+
         posterior = self.posterior(state, trajectories)
         if at_bound := at_bounds(posterior, self.prior):
             self.find(Code.AT_BOUND, parameters=at_bound)
@@ -314,6 +321,8 @@ class Estimator(ABC, Generic[S]):
 
     def _recorded(self, given: Recorded) -> Any:
         """``given``, or the trajectory that an observed x (D,) of a CallableSimulator stands for."""
+        from sipe_bayes.simulation.callable_simulator import CallableSimulator
+
         several = isinstance(given, list | tuple) and given and isinstance(given[0], Trajectory)
         if several or not isinstance(self.simulator, CallableSimulator) or isinstance(given, Trajectory | Trajectories):
             return given
@@ -327,7 +336,7 @@ class Estimator(ABC, Generic[S]):
         again = copy.copy(self)
         again.checkpoint = again.progress = None
         again.findings, again.diagnostics = Findings(), {}
-        again._given, again._bound = Given(), None
+        again._given, again._bound = type(self._given)(), None
         return again
 
     @property
@@ -369,30 +378,22 @@ class Estimator(ABC, Generic[S]):
         return self.name
 
     @property
-    def wild(self) -> IntArray:
-        """Samples (k, 3) that ``fit`` left out, by log, number in it and channel; none of most methods."""
-        return np.zeros((0, 3), np.int64)
-
-    def fitted_starts(self, theta: FloatArray) -> FloatArray | None:
-        """Initial states (W, D) of the segments at theta (N,), where ``fit`` estimated them."""
-        return None
-
-    def fitted_states(self, trajectories: Trajectories) -> FloatArray | None:
-        """States (R, T+1, S) of the logs of ``fit``, where it estimated them at every sample."""
+    def result(self) -> FitResult | None:
+        """The best optimum of ``fit``, where the method searches for such."""
         return None
 
     def usual_rest(self) -> float | None:
         """Rollouts that the fit still takes as a rule; None where nothing is known of that."""
         return None
 
-    def windows(self, trajectories: Trajectories) -> Windows:
+    def windows(self, trajectories: Trajectories) -> BoundLikelihood:
         """``bound``, for a method that takes no ``StateSpace``."""
-        bound = self.bound(trajectories)
-        assert isinstance(bound, Windows)  # as the constructor checks
-        return bound
+        return cast("BoundLikelihood", self.bound(trajectories))  # as the constructor checks
 
-    def bound(self, trajectories: Trajectories) -> Windows | Chain:
-        """The trajectories bound to the likelihood, budget counted; a Chain where the method ``searches``."""
+    def bound(self, trajectories: Trajectories) -> BoundLikelihood | BoundStates:
+        """The trajectories bound to the likelihood, budget counted; a ``StateSpace`` if the method ``searches``."""
+        from sipe_bayes.likelihood import bind
+
         if self._bound is None or self._bound[0] is not trajectories:
             bound = bind(self.likelihood, self.simulator, trajectories)
             bound.budget, bound.rollouts = self.budget, self.rollouts

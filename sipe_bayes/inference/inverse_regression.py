@@ -19,7 +19,7 @@ import numpy as np
 import scipy.stats
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.likelihood import QuadraticPrior
 
 _ROUNDING = 1e-9  # sd of an estimate, in the cube, below which its scatter is rounding
 

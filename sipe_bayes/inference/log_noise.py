@@ -9,10 +9,8 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.noise import Noise, states_throughout
-from sipe_bayes.likelihood.replicas import observation_noise
-from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.likelihood import Noise, Segments, StateSpace, observation_noise
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
@@ -45,7 +43,7 @@ def noise_is_unknown(
 ) -> bool:
     """Whether these are logs of a machine, whose noise only a fit tells."""
     of_machine = isinstance(simulator, Simulator) and isinstance(likelihood, Segments)
-    return of_machine and not states_throughout(trajectories)
+    return of_machine and not trajectories.states_throughout
 
 
 def fitted_noise(

@@ -5,11 +5,11 @@ independent Metropolis-Hastings proposal from the widened ``laplace`` posterior 
 independent draws where Laplace is good) mixed with differential evolution (ter Braak & Vrugt 2008), which finds its way
 where it is not.
 
-The target is that of ``windows.target``, whose starts and their Jacobian are those of the ``laplace`` fit that comes
+The target is that of ``laplace.target``, whose starts and their Jacobian are those of the ``laplace`` fit that comes
 first and also places the walkers; that saves D of D + 1 simulations. How far a fresh Jacobian would move the target is
 measured on some of the first walkers and reported as ``linearisation_error`` (sd in nats; NaN where it would cost more
-than a tenth of the budget). With ``StateSpace`` the target is that of ``state_space.target``, with the noise of the
-``laplace`` fit.
+than a tenth of the budget). With ``StateSpace`` the target is that of ``laplace.state_space.target``, with the noise
+of the ``laplace`` fit.
 
 Deviations:
 
@@ -36,15 +36,8 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.optimum import WindowOptimum
-from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
-from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
-from sipe_bayes.inference.laplace.strategy import Optimum, distinct
-from sipe_bayes.inference.laplace.target import Target, WindowFit, WindowTarget, value_cost
-from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
-from sipe_bayes.likelihood.state_space.chain import Chain
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.inference.laplace import Laplace, Target, TargetFit, noise_diagnostics, target_fit, target_of
+from sipe_bayes.likelihood import BoundLikelihood, BoundStates, BudgetExhausted, BudgetTooSmall, Segments
 from sipe_bayes.posterior import GaussianMixture, Particles
 from sipe_bayes.posterior.ensemble import mixing_of
 
@@ -135,7 +128,7 @@ class MCMCState:
         done: whether there are enough effective draws.
     """
 
-    fit: WindowFit | ChainFit
+    fit: TargetFit
     proposal: Proposal
     walkers: FloatArray
     log_prob: FloatArray
@@ -197,7 +190,10 @@ class MCMC(Estimator[MCMCState]):
         assert isinstance(normals, GaussianMixture)
         # what was noticed on the way holds; what its posterior says of itself does not hold of the chains
         self.findings.extend(search.snapshot.findings)
-        fit = self._fit(windows, distinct(search.snapshot.state.search.optima)[0])
+        assert search.best is not None
+        if Code.PROCESS_NOISE_UNSETTLED in {one.code for one in search.findings}:
+            self.find(Code.PROCESS_NOISE_UNSETTLED)  # the chains hold that noise
+        fit = target_fit(windows, search.best)
         if search.snapshot.state.draws is not None:  # kernels, which are slow to draw from
             mean, covariance = normals.gaussian_moments()
             normals = GaussianMixture([0.0], mean[None], covariance[None], self.space)
@@ -205,7 +201,7 @@ class MCMC(Estimator[MCMCState]):
         proposal = Proposal(normals.log_weights.numpy(), normals.means.numpy(), spread)
         random = np.random.RandomState(self.seed)
         count = self.options.walkers or max(tuning.least_walkers, 2 * len(self.space) + 2)
-        target = self._target(windows, fit)
+        target = target_of(self.prior, windows, fit)
         walkers, log_prob = self._place(target, proposal, count, random)
         best = fit.optimum.theta
         return MCMCState(
@@ -221,24 +217,6 @@ class MCMC(Estimator[MCMCState]):
             accepted=np.zeros(count),
             random=RandomState.of(random),
         )
-
-    def _fit(self, windows: Windows | Chain, optimum: Optimum) -> WindowFit | ChainFit:
-        """What the target needs of an optimum."""
-        if isinstance(windows, Chain):
-            assert isinstance(optimum, ChainOptimum)
-            if not optimum.settled:
-                self.find(Code.PROCESS_NOISE_UNSETTLED)  # the chains hold that noise
-            return ChainFit.at(windows, optimum)
-        assert isinstance(optimum, WindowOptimum)
-        return WindowFit.at(windows, optimum)
-
-    def _target(self, windows: Windows | Chain, fit: WindowFit | ChainFit) -> Target:
-        """The target of either likelihood: log p(theta | y) of walkers."""
-        if isinstance(windows, Chain):
-            assert isinstance(fit, ChainFit)
-            return ChainTarget(self.prior, windows, fit)
-        assert isinstance(fit, WindowFit)
-        return WindowTarget(self.prior, windows, fit)
 
     def _place(
         self, target: Target, proposal: Proposal, count: int, random: np.random.RandomState
@@ -268,11 +246,11 @@ class MCMC(Estimator[MCMCState]):
 
         windows = self.bound(trajectories)
         walkers, dimensions = state.walkers.shape
-        room = (self.budget - windows.rollouts) // (value_cost(windows) * walkers * len(trajectories))
+        target = target_of(self.prior, windows, state.fit)
+        room = (self.budget - windows.rollouts) // (target.value_cost * walkers * len(trajectories))
         steps = min(self.options.tuning.block, room)
         if steps < 1:
             raise BudgetExhausted("the next step of the chain does not fit")
-        target = self._target(windows, state.fit)
         moves = self.moves(state)
         sampler = emcee.EnsembleSampler(walkers, dimensions, target, vectorize=True, moves=moves)
         sampler.log_prob_fn = target  # bare: emcee's wrapper prints the walkers when it is interrupted
@@ -334,17 +312,19 @@ class MCMC(Estimator[MCMCState]):
         rates = np.repeat(state.accepted / len(state.chain), theta.shape[1])
         stats = {"lp": log_prob.ravel(), "acceptance_rate": rates}
         mixing, error = self._mixing(state), state.linearisation_error
-        self.diagnostics = {"mixing": {**mixing, "linearisation_error": error}, **_noise_of(state.fit)}
+        self.diagnostics = {"mixing": {**mixing, "linearisation_error": error}, **noise_diagnostics(state.fit.optimum)}
         if not (mixing["rhat"] <= THRESHOLDS.mixed and mixing["ess"] >= self.options.effective / 2):
             rhat, ess, remedy = mixing["rhat"], mixing["ess"], "raise the budget"
             self.find(Code.NOT_MIXED, what="chains", rhat=rhat, ess=ess, unit=" draws", remedy=remedy)
         if error > tuning.nonlinear:
-            chained = isinstance(self.bound(trajectories), Chain)
-            self.find(Code.NONLINEAR_STATES if chained else Code.NONLINEAR_STARTS, error=error)
+            segments = isinstance(self.likelihood, Segments)
+            self.find(Code.NONLINEAR_STARTS if segments else Code.NONLINEAR_STATES, error=error)
         flat = np.clip(theta.reshape(-1, len(self.space)), 0, 1)
         return Particles(flat, self.space, chains=len(theta), best=np.clip(state.best, 0, 1), sample_stats=stats)
 
-    def _linearisation_error(self, windows: Windows | Chain, target: Target, walkers: FloatArray) -> float:
+    def _linearisation_error(
+        self, windows: BoundLikelihood | BoundStates, target: Target, walkers: FloatArray
+    ) -> float:
         """Sd, over walkers, of the difference that a fresh Jacobian of the starts makes to the target (nats)."""
         tuning = self.options.tuning
         if not windows.num_start:
@@ -355,15 +335,6 @@ class MCMC(Estimator[MCMCState]):
             return float("nan")
         points = walkers[np.linspace(0, len(walkers) - 1, count).astype(int)]
         return float(np.std([float(target(p[None])[0]) - target.refreshed(p) for p in points]))
-
-
-def _noise_of(fit: WindowFit | ChainFit) -> dict[str, object]:
-    """The noise of the laplace fit."""
-    optimum = fit.optimum
-    noise = {"noise_sd": optimum.sd.tolist(), "noise_tau": optimum.tau.tolist()}
-    if isinstance(optimum, ChainOptimum):
-        return noise | optimum.diagnostics()
-    return noise
 
 
 class IndependentMove:

@@ -38,7 +38,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.options import Options, option
-from sipe_bayes.likelihood.quadratic_prior import UNIFORM_PRECISION, QuadraticPrior
+from sipe_bayes.likelihood import UNIFORM_PRECISION, QuadraticPrior
 from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.posterior.snooker import SnookerMove
 from sipe_bayes.posterior.truncated_normal import interval_quantile

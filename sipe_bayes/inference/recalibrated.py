@@ -58,10 +58,7 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.inverse_regression import Line
 from sipe_bayes.inference.log_noise import NOISE_BUDGET, fitted_noise, noise_is_unknown, process_noise
 from sipe_bayes.inference.recorded import Progress, Recorded
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
-from sipe_bayes.likelihood.replicas import Replicas, observation_noise
-from sipe_bayes.likelihood.settings import BudgetExhausted
+from sipe_bayes.likelihood import FLAT_PRECISION, BudgetExhausted, Noise, QuadraticPrior, Replicas, observation_noise
 from sipe_bayes.posterior import GaussianMixture, Posterior
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import numpy as np
 import torch
@@ -12,9 +12,11 @@ import torch
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.envs.task import Task
-from sipe_bayes.posterior import Posterior
-from sipe_bayes.simulation.simulator import Simulator
+
+if TYPE_CHECKING:
+    from sipe_bayes.envs.task import Task
+    from sipe_bayes.posterior import Posterior
+    from sipe_bayes.simulation.simulator import Simulator
 
 Progress = Callable[[str, int, int], None]
 """Called with (what is being done, rollouts so far, budget)."""
@@ -36,7 +38,9 @@ class GymnasiumEnvironment(Protocol):
 
 
 Observed = FloatArray | Iterable[float]
-Recorded = Trajectory | Iterable[Trajectory] | Trajectories | Observed | str | Task | Simulator | GymnasiumEnvironment
+Recorded: TypeAlias = (
+    "Trajectory | Iterable[Trajectory] | Trajectories | Observed | str | Task | Simulator | GymnasiumEnvironment"
+)
 """One or several trajectories, what a function was observed to give, or an environment: a task's name, a Task, a
 Simulator of one, ``sipe.make(...)``."""
 

@@ -20,7 +20,7 @@ ESTIMATORS = {
     "regression": ("sipe_bayes.inference.amortised.regression", "Regression"),
     "maml": ("sipe_bayes.inference.amortised.maml", "MAML"),
     "bayessim": ("sipe_bayes.inference.amortised.bayessim", "BayesSim"),
-    "laplace": ("sipe_bayes.inference.laplace.estimator", "Laplace"),
+    "laplace": ("sipe_bayes.inference.laplace", "Laplace"),
     "mcmc": ("sipe_bayes.inference.mcmc", "MCMC"),
     "bayesopt": ("sipe_bayes.inference.search.bayesopt", "BayesOpt"),
     "npe": ("sipe_bayes.inference.amortised.npe", "NPE"),

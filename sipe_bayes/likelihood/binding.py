@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import ClassVar, overload
 
@@ -20,6 +20,12 @@ from sipe_bayes.likelihood.windows import Windows, meets_impacts
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.contacts import may_touch
 from sipe_bayes.simulation.simulator import Simulator
+
+BoundLikelihood = Windows
+"""Logs bound to ``Segments``: simulated (``predict``, ``residuals``), linearised, and their noise and initial states
+estimated or integrated out of the linear model (``estimate_noise``, ``eliminate``, ``log_density``)."""
+BoundStates = Chain
+"""Logs bound to a ``StateSpace``."""
 
 
 @overload
@@ -60,7 +66,7 @@ def _chain(settings: StateSpace, simulator: Simulator | CallableSimulator, traje
     return chain
 
 
-def wants_state_space(simulator: Simulator, logs: Sequence[Trajectory]) -> bool:
+def _wants_state_space(simulator: Simulator, logs: Sequence[Trajectory]) -> bool:
     """Whether bodies strike or slip along logs, and a ``StateSpace`` can be had: without memory, all sensors prompt."""
     environment = simulator.environment
     if not logs or environment.memory_size or not may_touch(simulator.model):
@@ -71,15 +77,15 @@ def wants_state_space(simulator: Simulator, logs: Sequence[Trajectory]) -> bool:
 
 
 def default_likelihood(
-    simulator: Simulator | CallableSimulator, trajectories: Trajectories | None = None
+    simulator: Simulator | CallableSimulator, trajectories: Iterable[Trajectory] = ()
 ) -> Segments | StateSpace:
     """Segments of half a second, or a ``StateSpace`` for logs along which bodies strike or slip, where it can be had.
 
     Of a function white noise of the sd that it states, zero where it makes its own.
     """
     if not isinstance(simulator, CallableSimulator):
-        logs = [] if trajectories is None else [replace(log, states=None) for log in trajectories]
-        return StateSpace() if wants_state_space(simulator, logs) else Segments()
+        logs = [replace(log, states=None) for log in trajectories]
+        return StateSpace() if _wants_state_space(simulator, logs) else Segments()
     sd = simulator.noise_sd or (0.0,) * len(simulator.environment.channels)
     return Segments(None, noise="white", noise_sd=sd, starts="recorded")
 

@@ -15,20 +15,15 @@ from scipy.stats import chi2
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.rotations import between
+from sipe_bayes.core.smoothing import filled, left_by_smoothing, smoothed
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.sequences import Sequence
 from sipe_bayes.likelihood.settings import Segments, StateSpace
 from sipe_bayes.likelihood.starts.estimates import are_states
-from sipe_bayes.likelihood.starts.smoothing import filled, left_by_smoothing, smoothed
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
 
 NORMAL_MAD = 1.4826  # sd of a normal over the median of its absolute values
-
-
-def coefficients(gaps: FloatArray, tau: float | FloatArray) -> FloatArray:
-    """Autoregression coefficient of each gap in seconds; 0 for white noise (tau = 0) and infinite gaps."""
-    return np.where(np.asarray(tau) > 0, np.exp(-gaps / np.maximum(tau, 1e-300)), 0.0)
 
 
 @dataclass(frozen=True)
@@ -71,7 +66,7 @@ def pooled(sd: FloatArray, scales: IntArray) -> FloatArray:
 
 def whiten(residual: FloatArray, sequence: Sequence, sd: float, tau: float) -> FloatArray:
     """Whitened residuals (..., n) of one channel's residual (..., W * L)."""
-    a = coefficients(sequence.gaps, tau)[sequence.gap]
+    a = sequence.coefficients(tau)
     before = np.where(sequence.previous >= 0, residual[..., sequence.previous], 0.0)
     return (residual[..., sequence.index] - a * before) / (sd * np.sqrt(1 - a**2))
 
@@ -103,12 +98,6 @@ def noise_level(
     return np.where(np.isnan(stated), estimated, stated)
 
 
-def states_throughout(trajectories: Trajectories) -> bool:
-    """Whether the state of every sample is recorded, and not of none or the first alone."""
-    states = trajectories.states
-    return states is not None and int(np.isfinite(states[..., 0]).sum()) == int((trajectories.length + 1).sum())
-
-
 def _differences(trajectories: Trajectories, states: FloatArray, simulator: Simulator) -> FloatArray:
     """Samples less what the recorded states (R, T+1, S) show (R, T+1, O); NaN where nothing tells that."""
     seen, environment = trajectories.observations, simulator.environment
@@ -131,8 +120,8 @@ def _beside_states(off: FloatArray, trajectories: Trajectories, rough: FloatArra
     largest = np.abs(np.where(np.isfinite(seen), seen, 0.0)).max((0, 1))
     known = np.isfinite(off).sum((0, 1))
     differs = (np.abs(off) > 1e-6 * largest).any((0, 1))  # trajectories are kept in single precision at places
-    enough = (known >= 10) | ((known > 0) & states_throughout(trajectories))  # ten tell their sd to a quarter
-    unshown = not known.any() and not sensed and states_throughout(trajectories)
+    enough = (known >= 10) | ((known > 0) & trajectories.states_throughout)  # ten tell their sd to a quarter
+    unshown = not known.any() and not sensed and trajectories.states_throughout
     if not differs.any() and (enough.any() or unshown):
         return np.zeros(len(known))  # what the states do not show is as exact as what they do
     own = np.sqrt(np.nansum(off**2, (0, 1)) / np.maximum(known, 1))

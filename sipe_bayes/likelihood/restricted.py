@@ -18,8 +18,8 @@ from scipy.optimize import minimize
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.likelihood.block_tridiagonal import Border, Eliminated, eliminate
 from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import Noise, coefficients
-from sipe_bayes.likelihood.sequences import Sequence
+from sipe_bayes.likelihood.noise import Noise
+from sipe_bayes.likelihood.sequences import Sequence, coefficients
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,15 @@ class Sequence:
     gap: IntArray
     gaps: FloatArray
 
+    def coefficients(self, tau: float) -> FloatArray:
+        """Autoregression coefficient (n,) of each row; see ``coefficients``."""
+        return coefficients(self.gaps, tau)[self.gap]
+
+
+def coefficients(gaps: FloatArray, tau: float | FloatArray) -> FloatArray:
+    """Autoregression coefficient of each gap in seconds; 0 for white noise (tau = 0) and infinite gaps."""
+    return np.where(np.asarray(tau) > 0, np.exp(-gaps / np.maximum(tau, 1e-300)), 0.0)
+
 
 def sequences(observed: BoolArray, sample: IntArray, log: IntArray, dt: FloatArray) -> list[Sequence]:
     """One Sequence for each of C channels: its samples in order of time; a gap of over 20 samples begins a new one.

@@ -6,14 +6,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.simulation.callable_simulator import CallableSimulator
-from sipe_bayes.simulation.simulator import Simulator
+
+if TYPE_CHECKING:
+    from sipe_bayes.simulation.callable_simulator import CallableSimulator
+    from sipe_bayes.simulation.simulator import Simulator
 
 
 class BudgetExhausted(RuntimeError):
@@ -106,9 +108,6 @@ class StateSpace:
 
     def __post_init__(self) -> None:
         check_settings(self.starts, self.fit, self.noise_sd, zero=False)
-
-
-Likelihood = Segments | StateSpace
 
 
 def chosen_channels(

@@ -28,8 +28,10 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.rotations import nearest, written_near
 from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.likelihood.block_tridiagonal import Eliminated
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_level, noise_scales, pooled, whiten
+from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise, marginal
 from sipe_bayes.likelihood.sequences import Sequence, compared_samples, reached, sequences, spread_blocks
 from sipe_bayes.likelihood.settings import BudgetExhausted, Segments, chosen_channels, fitted_rotations
 from sipe_bayes.likelihood.starts.estimates import (
@@ -58,6 +60,10 @@ class Linearisation:
     residual: FloatArray
     jacobian: FloatArray
     valid: bool
+
+    def part(self, keep: IntArray) -> Linearisation:
+        """That of some of the windows."""
+        return Linearisation(self.residual[keep], self.jacobian[keep], self.valid)
 
 
 class Windows:
@@ -229,6 +235,36 @@ class Windows:
             setattr(view, name, getattr(self, name)[:, : steps + 1])
         return view._in_order()
 
+    def spread_over(self, most_steps: int, every_log: bool = False, at_least: int = 8) -> IntArray:
+        """Numbers of windows, spread evenly over the logs, for what a part of them answers.
+
+        Args:
+            most_steps: control steps that they have together, about.
+            every_log: whether one of every log is among them, whatever they take.
+            at_least: so many windows, whatever they take; all where there are no more.
+        """
+        every, count = self.num_windows, max(int(most_steps / self.steps.mean()), at_least)
+        if count >= every:
+            return np.arange(every)
+        kept = ((np.arange(count) + 0.5) * every / count).astype(int)
+        if every_log:
+            missed = np.setdiff1d(self.log, self.log[kept])
+            kept = np.sort(np.concatenate([kept, [np.flatnonzero(self.log == log)[0] for log in missed]]).astype(int))
+        return kept
+
+    def compared_late(self) -> Windows:
+        """The same, simulated on and compared as those of the latest model of ``settings.late``.
+
+        Where a model has a late sensor, windows are compared from later on. Their starts are then less well known, and
+        cost less: nats that a model without would pay for nothing that it lacks.
+        """
+        late = np.array([dict(self.settings.late).get(name, 0.0) for name in self.fitted])
+        if not late.any():
+            return self
+        latest, like = np.maximum(late, self.simulator.environment.remembers[self.channels]), copy.copy(self)
+        like.lead, like.begin, _ = reached(latest, latest, self.dt, self.log, self.start, self.stride)
+        return Windows(self.settings, self.simulator, self.trajectories, like)
+
     def part(self, keep: IntArray, observed: BoolArray | None = None) -> Windows:
         """Some of the windows, and samples (K, L, C) of theirs."""
         view = copy.copy(self)
@@ -348,6 +384,16 @@ class Windows:
         needed = self.owned | self.compared.any(-1)
         return predicted, np.asarray((good | ~needed).all(axis=(1, 2)))
 
+    def simulate(self, theta: FloatArray) -> FloatArray:
+        """Predictions (B, W, L, C) of thetas (B, N) from the windows' own starts.
+
+        Raises:
+            BudgetExhausted: instead of simulating beyond the budget.
+        """
+        together = max(32, self.simulator.wave(self.actions.shape[1]) // self.num_windows)
+        batches = np.split(theta, range(together, len(theta), together))
+        return np.concatenate([self.predict(rows, self.no_starts(len(rows)))[0] for rows in batches])
+
     @cached_property
     def _simulators(self) -> tuple[Simulator, Simulator]:
         """What simulates the windows, and the same in float64 on the processor."""
@@ -454,11 +500,52 @@ class Windows:
         n = lin.jacobian.shape[-1] - self.num_start
         return Moments(lin.residual, lin.jacobian, n, self.sequences, white)
 
+    def moments_of_each(self, residuals: FloatArray, jacobian: FloatArray) -> list[Moments]:
+        """For each of residuals (W, L, C, S) its ``moments`` with a jacobian (W, L, C, N + D), formed together."""
+        n, many = jacobian.shape[-1] - self.num_start, residuals.shape[-1]
+        rows = np.concatenate([jacobian[..., :n], residuals, jacobian[..., n:]], axis=-1)
+        whole = self.moments(Linearisation(np.zeros(rows.shape[:3]), rows, True))
+        starts = n + many + np.arange(2 * self.num_start)
+        return [whole.chosen(np.concatenate([np.arange(n), starts, [n + s]]), n) for s in range(many)]
+
     def chi_square(self, residual: FloatArray, noise: Noise) -> FloatArray:
         """Whitened sum of squares (B,) of residuals (B, W, L, C)."""
-        flat = residual.reshape(len(residual), -1, len(self.channels))
-        parts = [whiten(flat[..., c], s, float(noise.sd[c]), float(noise.tau[c])) for c, s in enumerate(self.sequences)]
-        return np.asarray(sum((p**2).sum(-1) for p in parts))
+        return np.asarray(sum((p**2).sum(-1) for p in self.whitened(residual, noise)))
+
+    def whitened(self, residual: FloatArray, noise: Noise) -> list[FloatArray]:
+        """Of each channel the whitened rows (B, n) of residuals (B, W, L, C), in the order of ``sequences``."""
+        flat, pairs = residual.reshape(len(residual), -1, len(self.channels)), zip(noise.sd, noise.tau, strict=True)
+        return [whiten(flat[..., c], self.sequences[c], float(sd), float(tau)) for c, (sd, tau) in enumerate(pairs)]
+
+    def pulls(
+        self, precision: FloatArray, pull: FloatArray, starts: FloatArray, free: BoolArray | None = None
+    ) -> Pulls:
+        """What besides the data pulls at theta and ``starts`` (W, D).
+
+        precision (N, N) and pull (N,): of the prior of theta. free (N,): which parameters may move, default all.
+        """
+        free = np.ones(len(pull), bool) if free is None else free
+        return Pulls(precision, pull, self.start_precision, -self.start_precision * starts, free)
+
+    def estimate_noise(self, moments: Moments, before: Noise, pulls: Pulls, coloured: bool) -> Noise:
+        """Noise that maximises the restricted likelihood of a linearisation; see ``restricted.estimate_noise``."""
+        span = float(self.dt.min()), self.trajectories.longest
+        return estimate_noise(moments, before, pulls, self.fixed_sd, coloured, *span, self.scales)
+
+    def eliminate(self, normal: FloatArray, num_theta: int, starts: FloatArray | None = None) -> Eliminated:
+        """Normal equations of theta with initial states marginalised, at ``starts`` (W, D), default zero.
+
+        normal (W, K, K): as of ``Moments.normal``, whose first columns are those of theta.
+        """
+        starts = self.no_starts() if starts is None else starts
+        return eliminate_starts(normal, num_theta, self.start_precision, -self.start_precision * starts)
+
+    def log_density(self, moments: Moments, noise: Noise, starts: FloatArray) -> tuple[float, FloatArray, float]:
+        """Log-likelihood at ``starts`` (W, D) with these integrated out, their best change, and the nats that it gains.
+
+        moments: of the residuals there and their Jacobian by initial states alone.
+        """
+        return marginal(moments, noise, starts, self.start_precision)
 
 
 def meets_impacts(simulator: Simulator, contacts: Contacts, known: bool = False) -> bool:

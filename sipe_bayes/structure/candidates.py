@@ -15,11 +15,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference.recorded import Tell, silent
-from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
-from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import FLAT_PRECISION, BoundLikelihood, Linearisation, Noise, QuadraticPrior
 from sipe_bayes.structure.extension import Placed
 from sipe_bayes.structure.probes import Effect, bounds, effects
 
@@ -48,7 +44,7 @@ class Candidate:
 
 
 def candidates(
-    windows: Windows,
+    windows: BoundLikelihood,
     theta: FloatArray,
     starts: FloatArray,
     noise: Noise,
@@ -68,7 +64,7 @@ def candidates(
         tell: called with what is being done.
     """
     linearisation = windows.linearise(theta, starts)
-    around = _Around(windows, theta, starts, noise, prior, linearisation.residual, linearisation.jacobian)
+    around = _Around(windows, theta, starts, noise, prior, linearisation)
     plain = around.fitted(np.zeros((*linearisation.residual.shape, 0)))
     seen = effects(windows, theta, starts, placed, tell)
     ranked: dict[str, Candidate] = {}
@@ -80,7 +76,7 @@ def candidates(
 
 
 def promised(
-    windows: Windows,
+    windows: BoundLikelihood,
     theta: FloatArray,
     starts: FloatArray,
     noise: Noise,
@@ -93,8 +89,7 @@ def promised(
     """
     if not change.any():
         return 0.0
-    linearisation = windows.linearise(theta, starts)
-    around = _Around(windows, theta, starts, noise, prior, linearisation.residual, linearisation.jacobian)
+    around = _Around(windows, theta, starts, noise, prior, windows.linearise(theta, starts))
     plain, with_it = (around.fitted(c) for c in (np.zeros((*change.shape, 0)), change[..., None]))
     return max(with_it.level - plain.level, 0.0) if with_it.amplitude[0] > 0 else 0.0
 
@@ -116,15 +111,14 @@ def first(ranked: list[Candidate], width: int, tied: float) -> list[Candidate]:
 
 @dataclass(frozen=True)
 class _Around:
-    """The logs linearised at an estimate: residual (W, L, C) and jacobian (W, L, C, N + D)."""
+    """The logs linearised at an estimate."""
 
-    windows: Windows
+    windows: BoundLikelihood
     theta: FloatArray
     starts: FloatArray
     noise: Noise
     prior: QuadraticPrior
-    residual: FloatArray
-    jacobian: FloatArray
+    lin: Linearisation
 
     def candidate(self, effect: Effect, plain: _Fitted) -> Candidate:
         """What an extension promises, within its bounds, beside the linear model without it."""
@@ -156,20 +150,17 @@ class _Around:
 
     def fitted(self, change: FloatArray) -> _Fitted:
         """The best noise, and what the probes' changes (W, L, C, K) amount to with all else following."""
-        n, k, windows = len(self.theta), change.shape[-1], self.windows
-        columns = np.concatenate([self.jacobian[..., :n], change, self.jacobian[..., n:]], axis=-1)
-        moments = Moments(self.residual, columns, n + k, windows.sequences)
+        n, k, windows, jacobian = len(self.theta), change.shape[-1], self.windows, self.lin.jacobian
+        columns = np.concatenate([jacobian[..., :n], change, jacobian[..., n:]], axis=-1)
+        moments = windows.moments(Linearisation(self.lin.residual, columns, self.lin.valid))
         precision, pull = np.zeros((n + k, n + k)), np.zeros(n + k)
         precision[:n, :n], pull[:n] = self.prior.precision + FLAT_PRECISION * np.eye(n), self.prior.pull(self.theta)
         normal = moments.normal(self.noise)
         # probes of no size of their own, so that the information exists
         precision[n:, n:] = _FAINT * np.diag(np.diag(normal.sum(0))[n : n + k])
-        start_pull = -windows.start_precision * self.starts
-        pulls = Pulls(precision, pull, windows.start_precision, start_pull, np.ones(n + k, bool))
-        span = float(windows.dt.min()), windows.trajectories.longest
-        noise = estimate_noise(moments, self.noise, pulls, windows.fixed_sd, True, *span, windows.scales)
+        noise = windows.estimate_noise(moments, self.noise, windows.pulls(precision, pull, self.starts), True)
         normal = moments.normal(noise)
-        arrow = eliminate_starts(normal, n + k, windows.start_precision, start_pull)
+        arrow = windows.eliminate(normal, n + k, self.starts)
         total = arrow.gradient + pull
         step = np.linalg.solve(arrow.precision + precision, total)
         square = float(normal[:, -1, -1].sum()) - arrow.explained - float(total @ step)

@@ -18,8 +18,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.laws.bound import driven_joint
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.noise import noise_level
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood, noise_level
 
 _DEGREES = 180 / math.pi
 FACTORS = (-1.0, _DEGREES, 1 / _DEGREES, 1000.0, 0.001)
@@ -53,7 +52,7 @@ class Column:
         return f"the {kind} {self.name} has {words[self.factor]}: multiply it by {self.factor:.6g}"
 
 
-def moving(windows: Windows) -> BoolArray:
+def moving(windows: BoundLikelihood) -> BoolArray:
     """The channels (C,) that show more than noise: what rests has neither sign nor unit.
 
     By five standard errors of a variance of white noise, and at least by a fifth, for the noise is an estimate.
@@ -63,7 +62,7 @@ def moving(windows: Windows) -> BoolArray:
     return np.asarray(windows.spread**2 > noise**2 * (1 + np.maximum(chance, 0.2)))
 
 
-def unexplained(windows: Windows, sd: FloatArray, shown: BoolArray) -> dict[str, float]:
+def unexplained(windows: BoundLikelihood, sd: FloatArray, shown: BoolArray) -> dict[str, float]:
     """The share of a channel's spread that the residuals' sd (C,) is, by name of those that are ``shown`` to move."""
     names = np.array(windows.fitted)[shown].tolist()
     return dict(zip(names, (sd[shown] / windows.spread[shown]).tolist(), strict=True))
@@ -82,7 +81,7 @@ def channels_of(environment: MjcfEnvironment) -> dict[tuple[str, bool], tuple[st
 
 
 def is_explained(
-    windows: Windows, sd: FloatArray, shown: BoolArray, column: Column, own: Sequence[str], most: float
+    windows: BoundLikelihood, sd: FloatArray, shown: BoolArray, column: Column, own: Sequence[str], most: float
 ) -> bool:
     """Whether beyond noise no more than a share of a column's ``own`` channels is left, of those that move.
 
@@ -126,7 +125,7 @@ def corrected(logs: Trajectories, columns: Sequence[Column], actuators: Sequence
     return replace(logs, observations=observations, actions=actions)
 
 
-def log_jacobian(windows: Windows, column: Column) -> float:
+def log_jacobian(windows: BoundLikelihood, column: Column) -> float:
     """Log of the density of a channel as given over that of the corrected one, n log |f| of n samples that are fitted.
 
     Of long logs these are not all (``Segments.seconds``).

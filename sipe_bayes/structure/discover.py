@@ -15,8 +15,7 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import MOST_ROLLOUTS, cores, nearest_name, whole
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.recorded import Progress, digest
-from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood, Segments
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
@@ -150,7 +149,7 @@ def check_restriction(
     own = [get_extension(name) for name in restriction.names if name not in EXTENSIONS]
     if not own:
         return
-    windows = Windows(likelihood, simulator, trajectories)
+    windows = BoundLikelihood(likelihood, simulator, trajectories)
     machine = machine_of(windows, np.clip(simulator.space.default_theta, 0, 1), windows.no_starts())
     for extension in own:
         if not list(placements(extension, machine)):

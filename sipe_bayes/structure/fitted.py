@@ -14,16 +14,9 @@ from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.importance import ImportanceTuning
-from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.optimum import WindowOptimum
-from sipe_bayes.inference.laplace.options import LaplaceTuning, SolverTuning
-from sipe_bayes.inference.laplace.strategy import distinct
+from sipe_bayes.inference.laplace import EVIDENCE_TUNING, Laplace
 from sipe_bayes.inference.recorded import Progress
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
-from sipe_bayes.likelihood.settings import BudgetTooSmall, Segments
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood, BudgetTooSmall, FitResult, Noise, QuadraticPrior, Segments
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
@@ -126,9 +119,9 @@ class Fitting:
         held = None if self.holdout is None else corrected(self.holdout, columns, actuators)
         return replace(self, trajectories=logs, holdout=held)
 
-    def windows(self, simulator: Simulator) -> Windows:
+    def windows(self, simulator: Simulator) -> BoundLikelihood:
         """The logs bound to a model."""
-        return Windows(self.likelihood, simulator, self.trajectories)
+        return BoundLikelihood(self.likelihood, simulator, self.trajectories)
 
     def prior_of(self, simulator: Simulator) -> Posterior:
         """The user's prior beside those of the extensions."""
@@ -152,23 +145,21 @@ class Fitting:
         prior = self.prior_of(simulator)
         windows = self.windows(simulator)
         left = max(budget - _scoring(windows), 1)
-        optimum = self._optimum(simulator, prior, self.trajectories, initial, left, progress)
-        best = optimum.best
-        both = scores(windows, best.theta, best.starts, Noise(best.sd, best.tau), QuadraticPrior.of(prior))
-        labels = tuple(one.label for one in placed)
-        rollouts, settled = optimum.rollouts + windows.rollouts, best.finding is None
+        best, rollouts = self._optimum(simulator, prior, self.trajectories, initial, left, progress)
+        assert best.starts is not None
+        both = scores(windows, best.theta, best.starts, best.noise, QuadraticPrior.of(prior))
         return FittedStructure(
-            labels,
+            tuple(one.label for one in placed),
             best.theta,
             best.mean,
             best.covariance,
-            best.sd,
-            best.tau,
+            best.noise.sd,
+            best.noise.tau,
             best.starts,
             both.evidence,
             both.held_out,
-            rollouts,
-            settled,
+            rollouts + windows.rollouts,
+            best.finding is None,
         )
 
     def step_gain(self, placed: Sequence[Placed], finer: Sequence[Placed], one: FittedStructure) -> tuple[float, int]:
@@ -204,20 +195,20 @@ class Fitting:
         assert self.holdout is not None
         simulator = self.simulator(placed)
         prior = GaussianMixture(torch.zeros(1), one.mean[None], one.covariance[None], simulator.space)
-        windows = Windows(self.likelihood, simulator, self.holdout)
+        windows = BoundLikelihood(self.likelihood, simulator, self.holdout)
         most = min(max(budget, 300 * len(self.holdout)), left) - _scoring(windows)
         if most < 1:
             return None, 0
         try:
-            optimum = self._optimum(simulator, prior, self.holdout, one.theta, most, progress)
-            best = optimum.best
-            both = scores(windows, best.theta, best.starts, Noise(best.sd, best.tau), QuadraticPrior.of(prior))
+            best, rollouts = self._optimum(simulator, prior, self.holdout, one.theta, most, progress)
+            assert best.starts is not None
+            both = scores(windows, best.theta, best.starts, best.noise, QuadraticPrior.of(prior))
         except BudgetTooSmall:
             return None, most  # so many at most
         except ValueError:  # LinAlgError is one
             return -np.inf, 0
         short = best.finding is not None and best.finding.code is Code.SEARCH_CUT_SHORT
-        return None if short else both.evidence, optimum.rollouts + windows.rollouts
+        return None if short else both.evidence, rollouts + windows.rollouts
 
     def _optimum(
         self,
@@ -227,11 +218,9 @@ class Fitting:
         initial: FloatArray | None,
         budget: int,
         progress: Progress | None,
-    ) -> _Optimum:
-        """The best optimum of some logs."""
+    ) -> tuple[FitResult, int]:
+        """The best optimum of some logs, and the rollouts that the fit took."""
         given = None if initial is None else initial[None]
-        one_noise = SolverTuning(compares=False)  # evidences of different noise do not compare
-        tuning = LaplaceTuning(solver=one_noise, importance=ImportanceTuning(wanted=False))
         laplace = Laplace(
             simulator,
             prior=prior,
@@ -240,13 +229,11 @@ class Fitting:
             likelihood=self.likelihood,
             progress=progress,
             initial=given,
-            tuning=tuning,
+            tuning=EVIDENCE_TUNING,
         )
         laplace.fit(logs)
-        assert laplace.state is not None
-        best = distinct(laplace.state.search.optima)[0]
-        assert isinstance(best, WindowOptimum)
-        return _Optimum(best, laplace.rollouts)
+        assert laplace.result is not None
+        return laplace.result, laplace.rollouts
 
 
 def beside(prior: Posterior, space: ParameterSpace) -> Posterior:
@@ -262,14 +249,6 @@ def beside(prior: Posterior, space: ParameterSpace) -> Posterior:
     return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space)
 
 
-def _scoring(windows: Windows) -> int:
+def _scoring(windows: BoundLikelihood) -> int:
     """Rollouts that the scores of an optimum take."""
     return (windows.num_theta + windows.num_start + 1) * len(windows.trajectories)
-
-
-@dataclass(frozen=True)
-class _Optimum:
-    """Where a fit ended, and the rollouts that it took."""
-
-    best: WindowOptimum
-    rollouts: int

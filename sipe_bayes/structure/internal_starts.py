@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood
 
 
 def mapped_starts(before: mujoco.MjModel, after: mujoco.MjModel, starts: FloatArray) -> FloatArray:
@@ -21,7 +21,9 @@ def mapped_starts(before: mujoco.MjModel, after: mujoco.MjModel, starts: FloatAr
     return out
 
 
-def carried_starts(before: mujoco.MjModel, windows: Windows, theta: FloatArray, starts: FloatArray) -> FloatArray:
+def carried_starts(
+    before: mujoco.MjModel, windows: BoundLikelihood, theta: FloatArray, starts: FloatArray
+) -> FloatArray:
     """Starts (B, W, D) in which an extended model's own states are those at the end of the window before.
 
     Args:
@@ -50,7 +52,7 @@ def carried_starts(before: mujoco.MjModel, windows: Windows, theta: FloatArray, 
     return out
 
 
-def _follows(windows: Windows) -> BoolArray:
+def _follows(windows: BoundLikelihood) -> BoolArray:
     """Which windows but the first (W - 1,) go on where the one before them ends."""
     return (windows.log[1:] == windows.log[:-1]) & (windows.start[1:] == windows.start[:-1] + windows.stride[:-1])
 

@@ -14,7 +14,7 @@ from sipe_bayes.envs.kinds.tendons import tendon_arms
 from sipe_bayes.envs.laws.base import SINGLE
 from sipe_bayes.envs.laws.bound import driven_joint
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood
 from sipe_bayes.simulation.simulator import Simulator
 
 _SAMPLES = 400  # of the logs, of which forces are computed
@@ -166,7 +166,7 @@ class Machine:
         return any(one.target == f"body:{body}.mass" for one in self.environment.added)
 
 
-def machine_of(windows: Windows, theta: FloatArray, starts: FloatArray) -> Machine:
+def machine_of(windows: BoundLikelihood, theta: FloatArray, starts: FloatArray) -> Machine:
     """The machine as it moves at an estimate.
 
     Args:
@@ -240,7 +240,7 @@ class _Own:
 
 
 def _motion(
-    simulator: Simulator, windows: Windows, theta: FloatArray, starts: FloatArray
+    simulator: Simulator, windows: BoundLikelihood, theta: FloatArray, starts: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """States (n, S) and controls (n, U) spread over the windows."""
     begin = windows.states(theta[None], starts[None])[0]

@@ -19,7 +19,7 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import Extension, Placed, extended
 from sipe_bayes.structure.internal_starts import mapped_starts
@@ -104,7 +104,7 @@ class StepError:
         )
 
 
-def shorter_steps(windows: Windows) -> list[Placed]:
+def shorter_steps(windows: BoundLikelihood) -> list[Placed]:
     """Pieces of a model that have no parameters: a quarter of its physics step, and a quarter of that.
 
     Of the error of Euler's steps they leave as much. None where the model does not compile with them, or no longer has
@@ -118,14 +118,16 @@ def shorter_steps(windows: Windows) -> list[Placed]:
         piece = Placed(ShorterSteps(), site, (), edit, np.zeros((0, 0, 0)))
         try:
             finer = Simulator(extended(environment, [piece]), windows.simulator.num_threads)
-            Windows(windows.settings, finer, windows.trajectories)
+            BoundLikelihood(windows.settings, finer, windows.trajectories)
         except ValueError:
             break
         pieces.append(piece)
     return pieces
 
 
-def step_change(windows: Windows, finer: Windows, theta: FloatArray, starts: FloatArray) -> FloatArray | None:
+def step_change(
+    windows: BoundLikelihood, finer: BoundLikelihood, theta: FloatArray, starts: FloatArray
+) -> FloatArray | None:
     """What shorter steps change of the predictions (W, L, C), None where a run diverges; by a rollout of each.
 
     Args:
@@ -140,7 +142,7 @@ def step_change(windows: Windows, finer: Windows, theta: FloatArray, starts: Flo
     return plain - short if own[0] and other[0] else None
 
 
-def step_error(windows: Windows, theta: FloatArray, starts: FloatArray) -> StepError | None:
+def step_error(windows: BoundLikelihood, theta: FloatArray, starts: FloatArray) -> StepError | None:
     """The error at theta (N,) and starts (W, D), by at most ``RUNS`` rollouts.
 
     None where a run diverges, nothing changes, or the model does not compile with half the step. None either where it
@@ -155,7 +157,7 @@ def step_error(windows: Windows, theta: FloatArray, starts: FloatArray) -> StepE
         half = _finer(simulator, 0.5 * float(steps.min()))
         if windows.settings.starts != "estimated" and half.model.nhistory != simulator.model.nhistory:
             return None
-        bound = Windows(windows.settings, half, windows.trajectories, windows)
+        bound = BoundLikelihood(windows.settings, half, windows.trajectories, windows)
     except ValueError:  # what the user's MJCF has that depends on the step
         return None
     own = 1 + simulator.model.nq + simulator.model.nv + simulator.model.na  # columns: time and what moves
@@ -176,7 +178,7 @@ def step_error(windows: Windows, theta: FloatArray, starts: FloatArray) -> StepE
     return StepError(change, float(steps.max()))
 
 
-def _timesteps(simulator: Simulator, windows: Windows) -> FloatArray:
+def _timesteps(simulator: Simulator, windows: BoundLikelihood) -> FloatArray:
     """Seconds (W,) of a physics step in each window."""
     return np.array([simulator.physics_steps(float(dt))[1] for dt in windows.dt])
 

@@ -22,7 +22,7 @@ from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.recorded import Tell, silent
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import WORLD, Extension, Placed, extended, imitating, members, placements
 from sipe_bayes.structure.internal_starts import carried_starts, mapped_starts
@@ -90,7 +90,7 @@ class _Change:
     trades: FloatArray
 
 
-def probes_cost(windows: Windows, theta: FloatArray) -> int:
+def probes_cost(windows: BoundLikelihood, theta: FloatArray) -> int:
     """Rollouts that ``probes`` takes, but for extensions that do not go together; at this theta at most."""
     if not isinstance(windows.simulator.environment, MjcfEnvironment):
         return 0
@@ -100,7 +100,7 @@ def probes_cost(windows: Windows, theta: FloatArray) -> int:
 
 
 def probes(
-    windows: Windows,
+    windows: BoundLikelihood,
     theta: FloatArray,
     starts: FloatArray,
     tell: Tell = silent,
@@ -136,7 +136,9 @@ def probes(
     return named, np.concatenate(changes, axis=-1), np.concatenate([np.zeros(0, bool), *one_sided])
 
 
-def _step_error(windows: Windows, theta: FloatArray, starts: FloatArray, tell: Tell, kept: Kept) -> StepError | None:
+def _step_error(
+    windows: BoundLikelihood, theta: FloatArray, starts: FloatArray, tell: Tell, kept: Kept
+) -> StepError | None:
     """What physics steps do to the predictions."""
 
     def made(kept: Kept) -> tuple[StepError, ...]:
@@ -148,7 +150,7 @@ def _step_error(windows: Windows, theta: FloatArray, starts: FloatArray, tell: T
 
 
 def _placed(
-    windows: Windows, theta: FloatArray, starts: FloatArray, extensions: Sequence[Extension] | None = None
+    windows: BoundLikelihood, theta: FloatArray, starts: FloatArray, extensions: Sequence[Extension] | None = None
 ) -> list[Placed]:
     """Extensions, by default all that the registry has, but those of last resort, wherever they have a place."""
     machine = machine_of(windows, theta, starts)
@@ -198,7 +200,7 @@ def bounds(plain: FloatArray, tried: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def effects(
-    windows: Windows,
+    windows: BoundLikelihood,
     theta: FloatArray,
     starts: FloatArray,
     placed: Sequence[Placed],
@@ -243,7 +245,7 @@ def _groups(placed: Sequence[Placed]) -> list[list[Placed]]:
     return list(groups.values())
 
 
-def _of_group(windows: Windows, theta: FloatArray, starts: FloatArray, group: list[Placed]) -> list[Effect]:
+def _of_group(windows: BoundLikelihood, theta: FloatArray, starts: FloatArray, group: list[Placed]) -> list[Effect]:
     environment = windows.simulator.environment
     assert isinstance(environment, MjcfEnvironment)
     whole = _extended(windows, environment, group)
@@ -253,7 +255,7 @@ def _of_group(windows: Windows, theta: FloatArray, starts: FloatArray, group: li
     return [e for one, own in alone if own is not None for e in _simulated(windows, theta, starts, [one], own)]
 
 
-def _extended(windows: Windows, environment: MjcfEnvironment, group: list[Placed]) -> Simulator | None:
+def _extended(windows: BoundLikelihood, environment: MjcfEnvironment, group: list[Placed]) -> Simulator | None:
     """The model with them all, beside the extensions that it has; None where it can not have them.
 
     None either of what has states of its own, where the logs' recorded states are to be held to.
@@ -268,10 +270,10 @@ def _extended(windows: Windows, environment: MjcfEnvironment, group: list[Placed
 
 
 def _simulated(
-    windows: Windows, theta: FloatArray, starts: FloatArray, group: list[Placed], simulator: Simulator
+    windows: BoundLikelihood, theta: FloatArray, starts: FloatArray, group: list[Placed], simulator: Simulator
 ) -> list[Effect]:
     """Effects of extensions that the simulator's model has."""
-    bound = Windows(windows.settings, simulator, windows.trajectories, windows)
+    bound = BoundLikelihood(windows.settings, simulator, windows.trajectories, windows)
     bound.budget = windows.budget - windows.rollouts
     plain = np.concatenate([theta, *(one.plain for one in group)])
     rows, first = [plain], len(theta)

@@ -23,17 +23,12 @@ Deviations:
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
-from sipe_bayes.likelihood.noise import Noise, coefficients
-from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
-from sipe_bayes.likelihood.restricted import eliminate_starts
-from sipe_bayes.likelihood.sequences import reached
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import FLAT_PRECISION, BoundLikelihood, Noise, QuadraticPrior
 from sipe_bayes.posterior.truncated_normal import TruncatedNormal
 
 _PIECES = 5  # of a single log
@@ -52,7 +47,9 @@ class Scores:
     held_out: float | None
 
 
-def scores(windows: Windows, theta: FloatArray, starts: FloatArray, noise: Noise, prior: QuadraticPrior) -> Scores:
+def scores(
+    windows: BoundLikelihood, theta: FloatArray, starts: FloatArray, noise: Noise, prior: QuadraticPrior
+) -> Scores:
     """Both scores of an optimum; costs a linearisation.
 
     Args:
@@ -65,7 +62,7 @@ def scores(windows: Windows, theta: FloatArray, starts: FloatArray, noise: Noise
     Raises:
         ValueError: where the simulation diverges.
     """
-    own, windows = windows, _led(windows)
+    own, windows = windows, windows.compared_late()
     linearisation = windows.linearise(theta, starts)
     own.rollouts += windows.rollouts if windows is not own else 0
     if not linearisation.valid:
@@ -73,7 +70,7 @@ def scores(windows: Windows, theta: FloatArray, starts: FloatArray, noise: Noise
     # one block for each window also where starts are known
     moments = windows.moments(linearisation)
     products, constants = moments.normal(noise), _log_determinants(windows, noise)
-    linear = _Linear(theta, starts, windows.start_precision, prior)
+    linear = _Linear(windows, theta, starts, prior)
     whole = linear.evidence(products, float(constants.sum()))
     pieces = _pieces(windows)
     if len(pieces) < 2 or len(products) < len(windows.log):
@@ -85,35 +82,21 @@ def scores(windows: Windows, theta: FloatArray, starts: FloatArray, noise: Noise
     return Scores(whole, float(sum(whole - other for other in without)))
 
 
-def _led(windows: Windows) -> Windows:
-    """The windows, simulated on and compared as those of the latest model that they are compared with.
-
-    Where a model has a late sensor, windows are compared from later on. Their starts are then less well known, and cost
-    less: nats that a model without would pay for nothing that it lacks.
-    """
-    late = np.array([dict(windows.settings.late).get(name, 0.0) for name in windows.fitted])
-    if not late.any():
-        return windows
-    latest, like = np.maximum(late, windows.simulator.environment.remembers[windows.channels]), copy.copy(windows)
-    like.lead, like.begin, _ = reached(latest, latest, windows.dt, windows.log, windows.start, windows.stride)
-    return Windows(windows.settings, windows.simulator, windows.trajectories, like)
-
-
 @dataclass(frozen=True)
 class _Linear:
     """The linear model around theta (N,) and starts (W, D)."""
 
+    windows: BoundLikelihood
     theta: FloatArray
     starts: FloatArray
-    start_precision: FloatArray
     prior: QuadraticPrior
 
     def evidence(self, products: FloatArray, constant: float) -> float:
         """Log p of the rows behind whitened products (W, K, K); constant: their log|2 pi V|."""
-        n, pull = len(self.theta), -self.start_precision * self.starts
-        solved = eliminate_starts(products, n, self.start_precision, pull)
-        starts = float((self.starts**2 @ self.start_precision).sum()) - solved.explained + solved.log_determinant
-        starts -= len(self.starts) * float(np.log(self.start_precision).sum())
+        n, precision = len(self.theta), self.windows.start_precision
+        solved = self.windows.eliminate(products, n, self.starts)
+        starts = float((self.starts**2 @ precision).sum()) - solved.explained + solved.log_determinant
+        starts -= len(self.starts) * float(np.log(precision).sum())
         level = -0.5 * (constant + float(products[:, -1, -1].sum()) + starts) - self.prior.energy(self.theta)
         flat = FLAT_PRECISION * np.eye(n)
         precision = solved.precision + self.prior.precision + flat
@@ -137,16 +120,15 @@ def _log_prior_integral(prior: QuadraticPrior) -> float:
     return 0.5 * len(own) * float(np.log(2 * np.pi)) - 0.5 * float(np.linalg.slogdet(precision)[1]) + mass
 
 
-def _log_determinants(windows: Windows, noise: Noise) -> FloatArray:
+def _log_determinants(windows: BoundLikelihood, noise: Noise) -> FloatArray:
     """Of each window (W,) its rows' log|2 pi V|."""
     out = np.zeros(windows.num_windows)
     for s, sd, tau in zip(windows.sequences, noise.sd.tolist(), noise.tau.tolist(), strict=True):
-        a = coefficients(s.gaps, tau)[s.gap]
-        out += np.bincount(s.window, np.log(2 * np.pi * sd**2 * (1 - a**2)), minlength=len(out))
+        out += np.bincount(s.window, np.log(2 * np.pi * sd**2 * (1 - s.coefficients(tau) ** 2)), minlength=len(out))
     return out
 
 
-def _pieces(windows: Windows) -> list[BoolArray]:
+def _pieces(windows: BoundLikelihood) -> list[BoolArray]:
     """Which windows (W,) each held-out piece has."""
     logs = np.unique(windows.log)
     if len(logs) > 1:

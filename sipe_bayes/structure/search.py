@@ -39,8 +39,7 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference.recorded import Progress
-from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
-from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
+from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, QuadraticPrior
 from sipe_bayes.structure.candidates import Candidate, candidates, first
 from sipe_bayes.structure.columns import Column, channels_of, choices, is_explained, log_jacobian, moving, unexplained
 from sipe_bayes.structure.extension import Extension, Placed, members, placements

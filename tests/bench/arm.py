@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.simulation.simulator import Simulator
 
 FloatArray = NDArray[np.float64]

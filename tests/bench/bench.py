@@ -40,7 +40,7 @@ import transfer
 
 from sipe_bayes.calibration.problem import prepare
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems import sysid
 

@@ -15,7 +15,7 @@ from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure import Structures, discover
 

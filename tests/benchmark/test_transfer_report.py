@@ -12,12 +12,7 @@ from sipe_bayes.benchmark.transfer import figures as transfer_figures
 from sipe_bayes.benchmark.transfer.figures import bars, curves
 from sipe_bayes.benchmark.transfer.report import table
 from sipe_bayes.benchmark.transfer.rows import WORDS, Contrast, by_quality, contrasts, in_order, label, relative, rows
-from sipe_bayes.benchmark.transfer.study import (
-    SETTING,
-    Point,
-    TransferRecord,
-    select,
-)
+from sipe_bayes.benchmark.transfer.study import SETTING, Point, TransferRecord, select
 from sipe_bayes.rl.evaluation import Evaluation
 
 # What the report makes of returns

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from sipe_bayes.calibration import check as checks
 from sipe_bayes.calibration.study import study_of_task
 from sipe_bayes.cli.app import app
-from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.likelihood import StateSpace
 
 
 def call(*arguments: object) -> Any:

@@ -23,7 +23,7 @@ from sipe_bayes.calibration.readers.base import LogError
 from sipe_bayes.calibration.readers.tables import read_table
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace import Laplace
 from tests.problems.lacking import write_lacking
 from tests.problems.log_tables import EXAMPLES, FAST, QUIET, TOML, configure, load, regular, write
 
@@ -323,7 +323,8 @@ def test_samples_that_the_fit_left_out_are_counted_with_them(monkeypatch: pytest
         train=Trajectories.stack([trajectory]),
         environment=SimpleNamespace(channels=("q",)),
     )
-    monkeypatch.setattr(Laplace, "wild", np.array([[0, 5, 0], [0, 6, 0], [0, 7, 0]]))
+    left_out = SimpleNamespace(outliers=np.array([[0, 5, 0], [0, 6, 0], [0, 7, 0]]))
+    monkeypatch.setattr(Laplace, "result", left_out)
     (counted,) = with_wild(cast(Problem, problem), Laplace.__new__(Laplace))
     assert counted.wild == {"q": 5}
 

@@ -9,7 +9,7 @@ from sipe_bayes.calibration.gathered import unmeasured_starts
 from sipe_bayes.core.findings import Severity
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.likelihood import Segments, StateSpace
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.bodies import BALL, DAMPING, POSE, cube, tosses
 

@@ -11,8 +11,7 @@ import pytest
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.bands import Bands, band_coverage, predictive_bands
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments, bind
 from sipe_bayes.posterior import GaussianMixture
 from tests.problems.pendulums import log, pendulum
 

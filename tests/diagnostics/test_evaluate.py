@@ -10,8 +10,7 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.evaluate import _jackknifed, channel_scores, compare_errors, errors, fitted_residuals
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Noise, Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.pendulums import XML, log, pendulum

@@ -8,8 +8,7 @@ import pytest
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.diagnostics.expected import Plan, contraction, expect, informations
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Noise, Segments
 from sipe_bayes.posterior import GaussianMixture, prior
 from tests.problems.carts import cart
 from tests.problems.pendulums import DT, log, pendulum

@@ -9,8 +9,7 @@ from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges, worth_measuring
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments, bind
 from tests.problems.pendulums import log, pendulum
 
 SPACE = ParameterSpace([Parameter("mass", 0.1, 2.0), Parameter("length", 0.1, 2.0), Parameter("other", -1.0, 1.0)])

@@ -20,8 +20,7 @@ from sipe_bayes.diagnostics.expected import Plan
 from sipe_bayes.diagnostics.suggest import KINDS, generate, limits, rank
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Noise, Segments
 from sipe_bayes.posterior import prior
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.carts import GEARED

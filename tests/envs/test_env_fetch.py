@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.registry import make_task
 from sipe_bayes.envs.tasks.fetch import _euler
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.likelihood import StateSpace, bind
 from sipe_bayes.simulation.engine import Run
 from sipe_bayes.simulation.simulator import Simulator
 

@@ -14,10 +14,10 @@ from sipe_bayes.core.findings import Code
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import importance
 from sipe_bayes.inference.importance import Draws, ImportanceTuning
-from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.laplace.optimum import WindowOptimum
 from sipe_bayes.inference.laplace.target import WindowFit, WindowTarget
-from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood import bind
 from sipe_bayes.posterior import GaussianMixture
 from sipe_bayes.posterior import prior as default_prior
 from tests.problems.pendulums import log as pendulum_log

@@ -13,8 +13,7 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.settings import BudgetTooSmall, Segments
+from sipe_bayes.likelihood import BudgetTooSmall, Segments, bind
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.pendulums import XML, coloured, log, pendulum
 

@@ -23,9 +23,9 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets import acting
 from sipe_bayes.diagnostics.coverage import check_calibration
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.recalibrated import Recalibrated
-from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.likelihood import Segments, StateSpace
 from sipe_bayes.posterior import Dirac, GaussianMixture, Posterior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from tests.problems.pendulums import log, pendulum

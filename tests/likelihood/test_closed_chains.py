@@ -12,9 +12,9 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.internal.closed_chains import close, dependent_joints
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.starts.estimates import estimate_states, start_sd, unmeasured_joints
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.likelihood import Segments, estimate_states, unmeasured_joints
+from sipe_bayes.likelihood.starts.estimates import start_sd
 from sipe_bayes.simulation.simulator import Simulator
 
 LINKAGE = """<mujoco><option timestep="0.001" integrator="implicitfast"/><worldbody>

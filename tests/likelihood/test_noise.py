@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from sipe_bayes.likelihood import Noise
 from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import Noise, coefficients, whiten
+from sipe_bayes.likelihood.noise import whiten
 from sipe_bayes.likelihood.restricted import (
     Pulls,
     eliminate_starts,
@@ -23,7 +24,7 @@ from sipe_bayes.likelihood.restricted import (
     restricted,
     restricted_slopes,
 )
-from sipe_bayes.likelihood.sequences import sequences
+from sipe_bayes.likelihood.sequences import coefficients, sequences
 
 N, D = 3, 2
 SIGMAS = 5.0

@@ -11,8 +11,7 @@ import sipe_bayes as sipe
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.datasets.trajectory_sets import TASKS
-from sipe_bayes.likelihood.noise import noise_level
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments, noise_level
 from tests.problems.pendulums import DT, coloured, pendulum
 
 STEPS = 400

@@ -7,8 +7,7 @@ import numpy as np
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.replicas import Replicas
+from sipe_bayes.likelihood import Noise, Replicas
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.pendulums import XML
 from tests.problems.springs import HIGH, LOW, PROCESS, spring, spring_logs, spring_step

@@ -10,9 +10,9 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.internal.resting import loose_joints, resting_joints
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.starts.estimates import contacts_of, estimate_states, start_sd, unmeasured_joints
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.likelihood import Segments, estimate_states, unmeasured_joints
+from sipe_bayes.likelihood.starts.estimates import contacts_of, start_sd
 from sipe_bayes.simulation.contacts import Contacts
 from sipe_bayes.simulation.simulator import Simulator
 

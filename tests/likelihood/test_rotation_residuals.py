@@ -8,10 +8,9 @@ import pytest
 
 from sipe_bayes.core.rotations import added, quaternions
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.likelihood import Noise, Segments
 from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.restricted import Pulls, estimate_noise
-from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.starts.estimates import STATE_STEP
 from sipe_bayes.likelihood.windows import Windows
 from tests.problems.bodies import cube, tosses

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from sipe_bayes.core.rotations import between, quaternions
+from sipe_bayes.core.smoothing import smoothed, smoothed_rotations
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.starts.estimates import estimate_states, unmeasured_joints
-from sipe_bayes.likelihood.starts.smoothing import smoothed, smoothed_rotations
+from sipe_bayes.likelihood import Segments, estimate_states, unmeasured_joints
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.bodies import BALL, CUBE, DAMPING, FRICTION, POSE, ROUND, cube, tosses, turns

@@ -11,9 +11,9 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.rotations import aligned, product, quaternions, rotation_vectors
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.wild_samples import jumps, wild_positions, wild_residuals
+from sipe_bayes.core.wild_samples import jumps, wild_positions
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.likelihood import Segments, wild_residuals
 from sipe_bayes.likelihood.windows import Windows
 from tests.problems import pendulums
 from tests.problems.bodies import cube, tosses
@@ -156,9 +156,9 @@ def test_a_fit_is_as_good_without_wild_samples(share: float, size: float) -> Non
         method = Laplace(simulator, restarts=1)
         fits[name] = method, method.fit(replace(clean, observations=seen))
     (plain, before), (robust, after) = fits["clean"], fits["wild"]
-    assert not len(plain.wild)
+    assert not len(plain.result.outliers)
     assert Code.WILD_SAMPLES not in [item.code for item in plain.findings]
-    assert robust.wild[:, 1].tolist() == rows.tolist()
+    assert robust.result.outliers[:, 1].tolist() == rows.tolist()
     assert [item.code for item in robust.findings] == [Code.WILD_SAMPLES]
     np.testing.assert_allclose(after.stddev, before.stddev, rtol=0.05)
     assert ((after.mean - before.mean).abs() < 0.3 * before.stddev).all()

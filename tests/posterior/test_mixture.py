@@ -13,11 +13,7 @@ import pytest
 import torch
 from scipy import stats
 
-from sipe_bayes.posterior import (
-    GaussianMixture,
-    Particles,
-    prior,
-)
+from sipe_bayes.posterior import GaussianMixture, Particles, prior
 from tests.problems.posteriors import RIDGE, SIGMAS, random_mixture, seeded, single, space_of
 
 

@@ -11,13 +11,7 @@ import torch
 from scipy import stats
 
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
-from sipe_bayes.posterior import (
-    Dirac,
-    Particles,
-    load_posterior,
-    prior,
-    uniform,
-)
+from sipe_bayes.posterior import Dirac, Particles, load_posterior, prior, uniform
 from tests.problems.posteriors import space_of
 
 

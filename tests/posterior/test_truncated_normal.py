@@ -13,12 +13,7 @@ import pytest
 from scipy import stats
 from scipy.special import log_ndtr
 
-from sipe_bayes.posterior.truncated_normal import (
-    TruncatedNormal,
-    interval_moments,
-    interval_quantile,
-    log_interval,
-)
+from sipe_bayes.posterior.truncated_normal import TruncatedNormal, interval_moments, interval_quantile, log_interval
 from tests.problems.posteriors import RIDGE, SIGMAS, seeded, single
 
 

@@ -11,7 +11,7 @@ import torch
 import sipe_bayes as sipe
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectory
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.posterior import GaussianMixture
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator

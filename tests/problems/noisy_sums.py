@@ -8,7 +8,7 @@ from scipy import stats
 
 import sipe_bayes as sipe
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.posterior import IndependentPrior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.laplace.estimator import Laplace, LaplaceState
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.inference.laplace.estimator import LaplaceState
 from sipe_bayes.posterior import GaussianMixture, Posterior
 
 

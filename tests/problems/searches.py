@@ -11,7 +11,7 @@ import torch
 
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.inference.search import base
+from sipe_bayes.likelihood import BoundLikelihood
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.pendulums import log, pendulum
 
@@ -83,14 +83,14 @@ def check_resumes(name: str, budget: int, tmp_path: Path, **settings: Any) -> No
 def check_divergence(name: str, budget: int, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> None:
     """A tenth of the prior diverges: the rest is searched, and a warning says so. Where all diverge, an error does."""
     simulator, trajectory, theta = problem()
-    plain = base.simulate
+    plain = BoundLikelihood.simulate
 
     def partly(windows: Any, thetas: np.ndarray) -> np.ndarray:
         predicted = plain(windows, thetas).copy()
         predicted[thetas[:, 0] > limit, -1, 5:] = np.nan
         return predicted
 
-    monkeypatch.setattr(base, "simulate", partly)
+    monkeypatch.setattr(BoundLikelihood, "simulate", partly)
     limit = 0.9
     fit = (
         get_estimator(simulator, name, seed=0, budget=budget, initial_mean=1.0, **settings)

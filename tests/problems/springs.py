@@ -8,8 +8,7 @@ import sipe_bayes as sipe
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.base import START_SD
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.likelihood import StateSpace, bind
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.state_space.linearisation import ChainNoise
 from sipe_bayes.simulation.simulator import Simulator

@@ -13,24 +13,14 @@ from sipe_bayes.core import files
 from sipe_bayes.core.finding_advice import ADVICE
 from sipe_bayes.core.findings import Code, Guard, Severity
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
-from sipe_bayes.diagnostics.records import (
-    ChannelNoise,
-    Mixing,
-)
+from sipe_bayes.diagnostics.records import ChannelNoise, Mixing
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.posterior import Dirac, prior
 from sipe_bayes.report import page as report
 from sipe_bayes.report import verdicts as judged
 from sipe_bayes.report.drawing import new_figure, png
 from sipe_bayes.report.words import significant
-from tests.problems.calibrations import (
-    EVIL,
-    Page,
-    make_calibration,
-    noticed,
-    ridge,
-    with_chains,
-)
+from tests.problems.calibrations import EVIL, Page, make_calibration, noticed, ridge, with_chains
 
 
 @pytest.fixture(autouse=True)

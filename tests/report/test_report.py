@@ -17,13 +17,7 @@ from sipe_bayes.report import calibration_plots as plots
 from sipe_bayes.report import panels
 from sipe_bayes.report.colours import POSTERIOR
 from sipe_bayes.report.drawing import png
-from tests.problems.calibrations import (
-    make_calibration,
-    ridge,
-    signal,
-    summaries,
-    with_chains,
-)
+from tests.problems.calibrations import make_calibration, ridge, signal, summaries, with_chains
 
 
 @pytest.fixture(autouse=True)

@@ -7,23 +7,12 @@ import pytest
 
 from sipe_bayes.core.findings import Code, Finding, Findings, Severity
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior
-from sipe_bayes.diagnostics.records import (
-    BandCoverage,
-    ChannelScore,
-    Comparison,
-)
+from sipe_bayes.diagnostics.records import BandCoverage, ChannelScore, Comparison
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.report import page as report
 from sipe_bayes.report import verdicts as judged
 from sipe_bayes.report.words import significant
-from tests.problems.calibrations import (
-    BETTER,
-    LACKS,
-    Page,
-    make_calibration,
-    noticed,
-    with_chains,
-)
+from tests.problems.calibrations import BETTER, LACKS, Page, make_calibration, noticed, with_chains
 
 
 @pytest.fixture(scope="module")

@@ -14,11 +14,11 @@ import torch
 import sipe_bayes as sipe
 from sipe_bayes.inference import ESTIMATORS
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling
-from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.inference.search.base import Search
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.discrepancy import StateDifference, channel_scale, simulate
+from sipe_bayes.inference.search.discrepancy import StateDifference, channel_scale
+from sipe_bayes.likelihood import bind
 from tests.problems.quick import SMALL
 
 SPACE = sipe.ParameterSpace([sipe.Parameter("a", low=0.0, high=2.0), sipe.Parameter("b", low=-1.0, high=1.0)])
@@ -106,7 +106,7 @@ def test_an_output_that_never_varies_is_left_out_and_all_invalid_is_no_scale() -
         simulator,
         sipe.Trajectories.stack(simulator.trajectory([1.0, 7.0, 0.0])),
     )
-    first = simulate(windows, np.random.default_rng(0).random((50, 2)))
+    first = windows.simulate(np.random.default_rng(0).random((50, 2)))
     scale = channel_scale(windows, first)
     np.testing.assert_allclose(scale, [first[:, 0, 1, 0].std(), 7.0, 1.0])
     assert np.isfinite(StateDifference(windows, scale)(first)).all()

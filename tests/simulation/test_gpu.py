@@ -28,7 +28,7 @@ from sipe_bayes.core.files import OutputError
 from sipe_bayes.core.findings import Code
 from sipe_bayes.envs.registry import TASKS
 from sipe_bayes.inference.registry import get_estimator
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.models.policy import load_policy
 from sipe_bayes.rl.settings import Settings as Learning
 from sipe_bayes.rl.train import train

@@ -17,7 +17,7 @@ from sipe_bayes.envs.export import write_identified
 from sipe_bayes.envs.internal.elastic import NUMBERS as ELASTIC_NUMBERS
 from sipe_bayes.envs.laws.registry import LAWS
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import Placed, extended, placements

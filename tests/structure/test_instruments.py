@@ -9,7 +9,7 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import extended, members, placements

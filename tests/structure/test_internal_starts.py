@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import Placed, extended, placements

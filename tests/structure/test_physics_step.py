@@ -17,9 +17,7 @@ from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.misfit.tolerances import Tolerances, untold
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Noise, Segments, bind
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Particles, prior
 from sipe_bayes.simulation.simulator import Simulator

@@ -12,13 +12,9 @@ from sipe_bayes.core.arrays import BoolArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.optimum import WindowOptimum
-from sipe_bayes.inference.laplace.strategy import distinct
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.likelihood import Noise, QuadraticPrior, Segments
 from sipe_bayes.likelihood.restricted import marginal
-from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
@@ -124,10 +120,9 @@ def test_importance_sampling_gives_the_evidence_of_a_pendulum_with_friction() ->
     prior, likelihood = default_prior(simulator.space), Segments(0.5, "ar1")
     laplace = Laplace(simulator, likelihood=likelihood, seed=0)
     laplace.fit(recorded)
-    assert laplace.state is not None
-    best = distinct(laplace.state.search.optima)[0]
-    assert isinstance(best, WindowOptimum)
-    windows, noise = Windows(likelihood, simulator, recorded), Noise(best.sd, best.tau)
+    best = laplace.result
+    assert best is not None
+    windows, noise = Windows(likelihood, simulator, recorded), best.noise
     got = scores(windows, best.theta, best.starts, noise, QuadraticPrior.of(prior)).evidence
     normal = scipy.stats.multivariate_normal(best.mean, 1.5 * best.covariance)
     draws = normal.rvs(400, random_state=0)

@@ -12,7 +12,7 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.likelihood.settings import BudgetTooSmall, Segments
+from sipe_bayes.likelihood import BudgetTooSmall, Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.structure import DiscoverOptions, Extension, Restriction, Structures, discover
 from sipe_bayes.structure.columns import Column, channels_of, choices, log_jacobian, moving, unexplained

@@ -14,8 +14,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from sipe_bayes.benchmark.leaderboard.run import DRAWS, Estimate, OwnMethod, draws_of
 from sipe_bayes.benchmark.leaderboard.task import Case, Problem, Task
 from sipe_bayes.calibration.gathered import most_probable
@@ -26,11 +24,8 @@ from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.misfit.tolerances import usual
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.arguments import without_likelihood
-from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.likelihood import QuadraticPrior, Segments, bind
 from sipe_bayes.posterior import Posterior
 
 NAME = "calibrate"
@@ -49,11 +44,11 @@ class _Fit:
         method, theta = self.method, self.posterior.mode.numpy()
         assert isinstance(method.likelihood, Segments)
         windows = bind(method.likelihood, method.simulator, self.logs)
-        noise = Noise(*(np.array(method.diagnostics[key]) for key in ("noise_sd", "noise_tau")))
-        starts = method.fitted_starts(theta)
-        starts = windows.no_starts() if starts is None else starts
+        assert method.result is not None
+        starts = method.result.starts_at(theta)
+        assert starts is not None
         prior, linearised = QuadraticPrior.of(method.prior), windows.linearise(theta, starts)
-        return ProbedLogs(windows, theta, noise, starts, prior, linearised)
+        return ProbedLogs(windows, theta, method.result.noise, starts, prior, linearised)
 
 
 class Calibrate:

@@ -19,7 +19,7 @@ from sipe_bayes.datasets import acting
 from sipe_bayes.datasets.demonstrations import behaviour_of
 from sipe_bayes.datasets.trajectory_sets import TASKS as NINE
 from sipe_bayes.envs.registry import make_task
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.simulation.simulator import Simulator
 
 _STEPS, _KNOWN, _TRUTHS, _NOISE, _BUDGET = 50, 5, 5, 0.01, 1000

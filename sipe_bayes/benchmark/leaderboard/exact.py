@@ -27,8 +27,7 @@ from sipe_bayes.benchmark.leaderboard.task import Case, Kind, Problem, Task
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.likelihood.binding import default_likelihood
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments, default_likelihood
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 
 _OBSERVATIONS, _BUDGET, _DRAWS = 20, 10_000, 2000

@@ -18,7 +18,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import extended, members, placements
 from sipe_bayes.structure.machine import Machine, machine_of
@@ -93,7 +93,7 @@ def _case(simulator: Simulator, name: str, number: int) -> Case:
     start = simulator.default_state()
     quiet = simulator.rollout(truth, commands[0], start, _DT)
     seen = Trajectories.stack(Trajectory(quiet.observations[0], commands[0], _DT, channels=quiet.channels))
-    windows = Windows(FROM_START.__class__(), simulator, seen)
+    windows = BoundLikelihood(FROM_START.__class__(), simulator, seen)
     machine = machine_of(windows, truth, windows.no_starts())
     engine, theta = _with_effect(simulator, machine, _ALL[name], truth, number)
     clean = [engine.rollout(theta, command, engine.default_state(), _DT).observations[0] for command in commands]

@@ -14,9 +14,7 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood, Segments, bind
 from sipe_bayes.posterior import Posterior, prior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
@@ -87,7 +85,7 @@ class Problem:
         """The case of a name; raises KeyError for another."""
         return {case.name: case for case in self.cases}[name]
 
-    def windows(self, trajectories: Trajectories) -> Windows:
+    def windows(self, trajectories: Trajectories) -> BoundLikelihood:
         """Logs as they are compared with simulations."""
         return bind(self.likelihood, self.simulator, trajectories)
 

@@ -18,36 +18,36 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.agreement import LogEstimates, linear_estimates, log_estimates, parts_of
 from sipe_bayes.diagnostics.evaluate import LOOKED_AT, best_starts, channel_noise, white_noise
 from sipe_bayes.diagnostics.records import ChannelNoise, LogReport
-from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Tell
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.settings import StateSpace
-from sipe_bayes.likelihood.windows import Linearisation, Windows
+from sipe_bayes.likelihood import BoundLikelihood, Linearisation, Noise, StateSpace, bind
 
 
 def from_fitted_states(problem: Problem, method: Estimator) -> Problem:
     """The problem with the training logs in the states where a fit with a ``StateSpace`` says that they were."""
-    states = method.fitted_states(problem.train)
+    states = None if method.result is None else method.result.states
     return problem if states is None else replace(problem, train=replace(problem.train, states=states))
+
+
+def _outliers(method: Estimator) -> IntArray:
+    return np.zeros((0, 3), np.int64) if method.result is None else method.result.outliers
 
 
 def tamed(logs: Trajectories, method: Estimator) -> Trajectories:
     """The logs without the samples that the fit left out."""
-    if not len(method.wild):
+    if not len(outliers := _outliers(method)):
         return logs
     observations = logs.observations.copy()
-    observations[tuple(method.wild.T)] = np.nan
+    observations[tuple(outliers.T)] = np.nan
     return replace(logs, observations=observations)
 
 
 def with_wild(problem: Problem, method: Estimator) -> list[LogReport]:
     """What the logs held, with the samples that the fit left out."""
-    if not len(method.wild):
+    if not len(outliers := _outliers(method)):
         return list(problem.reports)
     counts = {report.name: Counter(report.wild) for report in problem.reports}
-    for log, _, channel in method.wild:
+    for log, _, channel in outliers:
         counts[problem.train.names[log]][problem.environment.channels[channel]] += 1
     return [replace(report, wild=dict(counts[report.name])) for report in problem.reports]
 
@@ -66,7 +66,7 @@ class Fit:
     that tumble. ``least_squares``: whether theta is that of plain least squares, though residuals are coloured.
     """
 
-    windows: Windows
+    windows: BoundLikelihood
     theta: FloatArray
     noise: Noise
     starts: FloatArray
@@ -77,14 +77,14 @@ class Fit:
     def of(cls, problem: Problem, method: Estimator, theta: FloatArray, checks: Checks) -> Fit:
         """Of a fit that has ended."""
         windows = bind(problem.segments, problem.simulator, problem.train)
-        windows.mask(method.wild)
+        windows.mask(_outliers(method))
         chain = isinstance(problem.likelihood, StateSpace)
 
         def made(tell: Tell, kept: Kept) -> _At:
             noise = _noise_of(method, windows, theta)
             if chain:
                 return _At(noise, windows.no_starts())
-            starts = method.fitted_starts(theta)
+            starts = None if method.result is None else method.result.starts_at(theta)
             return _At(noise, best_starts(windows, theta, noise) if starts is None else starts)
 
         at = checks.of(Check.STARTS, _At, made)
@@ -95,7 +95,7 @@ class Fit:
     @functools.cached_property
     def some(self) -> IntArray:
         """Numbers (K,) of the windows that are linearised: all, or of long logs some, spread evenly over each."""
-        return spread_windows(self.windows, LOOKED_AT, every_log=True)
+        return self.windows.spread_over(LOOKED_AT, every_log=True)
 
     @functools.cached_property
     def lin(self) -> Linearisation | None:
@@ -116,7 +116,7 @@ def drifting(noise: Mapping[str, ChannelNoise]) -> list[Finding]:
     return [finding(Code.NOISE_DRIFTS, channels=", ".join(mine), tau=tau)] if mine else []
 
 
-def _noise_of(method: Estimator, windows: Windows, theta: FloatArray) -> Noise:
+def _noise_of(method: Estimator, windows: BoundLikelihood, theta: FloatArray) -> Noise:
     """The residuals' noise: the estimator's, or white of the size that its best point leaves."""
     if "noise_sd" in method.diagnostics:
         return Noise(np.array(method.diagnostics["noise_sd"]), np.array(method.diagnostics["noise_tau"]))

@@ -7,7 +7,6 @@ from sipe_bayes.calibration.init.trials import Trial
 from sipe_bayes.calibration.init.windows import FEW
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.findings import Code, Finding, finding
-from sipe_bayes.likelihood.settings import fitted_channels
 
 _SHARE = 0.1  # of the time in which the motion goes to and fro: what short windows miss, no start explains
 _ROUNDS = 6  # of the fit, where the model as given misses a column
@@ -26,6 +25,7 @@ def not_followed(problem: Problem) -> tuple[Finding, ...]:
     if lost:
         left = fit(trial, trial.given, (0,), _ROUNDS)
         lost = trial.unfollowed(trial.given, left.theta)
-    fitted = fitted_channels(problem.environment.channels, problem.likelihood.fit)
-    names = {problem.environment.channels[k]: by for k, by in lost.items() if k in fitted}
+    channels = problem.environment.channels
+    fitted = problem.likelihood.fit or channels
+    names = {channels[k]: by for k, by in lost.items() if channels[k] in fitted}
     return tuple(finding(Code.COLUMN_NOT_FOLLOWED, channel=name, times=by) for name, by in names.items())

@@ -24,8 +24,7 @@ from sipe_bayes.diagnostics.records import Misfit, Residual
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.random_effects import LogEstimate
 from sipe_bayes.inference.recorded import Tell
-from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
-from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.likelihood import QuadraticPrior, StateSpace
 from sipe_bayes.posterior import Particles, Posterior
 
 

@@ -18,8 +18,7 @@ from sipe_bayes.diagnostics.misfit.probed_logs import steps_of
 from sipe_bayes.diagnostics.prior_predictive import PREDICTIVE
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Progress, Tell
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.likelihood import StateSpace, bind
 from sipe_bayes.simulation.base import Simulated
 from sipe_bayes.structure.probes import probes_cost
 

@@ -22,9 +22,7 @@ from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, follows, outsi
 from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Signal
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Tell
-from sipe_bayes.likelihood.replicas import observation_noise
-from sipe_bayes.likelihood.wild_samples import wild_residuals
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood, observation_noise, wild_residuals
 from sipe_bayes.posterior import Posterior
 
 
@@ -46,7 +44,7 @@ class Predictions:
     """Of the logs at theta (N,), by use: windows from measured starts, predicted (2, W, L, C), and the errors there."""
 
     theta: FloatArray
-    windows: dict[str, Windows]
+    windows: dict[str, BoundLikelihood]
     predicted: dict[str, FloatArray]
     train: list[ChannelScore]
     holdout: list[ChannelScore]
@@ -100,9 +98,9 @@ class Predictions:
         return drawn
 
 
-def every_channel(problem: Problem, logs: Trajectories) -> Windows:
-    """Windows of logs by which they are scored and drawn, in all channels."""
-    return Windows(replace(problem.segments, fit=None), problem.simulator, logs)
+def every_channel(problem: Problem, logs: Trajectories) -> BoundLikelihood:
+    """BoundLikelihood of logs by which they are scored and drawn, in all channels."""
+    return BoundLikelihood(replace(problem.segments, fit=None), problem.simulator, logs)
 
 
 @dataclass(frozen=True)

@@ -20,16 +20,7 @@ from sipe_bayes.calibration.init.draft import (
     unit_words,
 )
 from sipe_bayes.calibration.init.machine import Machine
-from sipe_bayes.calibration.init.ranking import (
-    DECIDED,
-    Case,
-    Layout,
-    Ranking,
-    fitted,
-    named_answers,
-    ranked,
-    rivals_of,
-)
+from sipe_bayes.calibration.init.ranking import DECIDED, Case, Layout, Ranking, fitted, named_answers, ranked, rivals_of
 from sipe_bayes.calibration.init.trials import Trial, followed
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference.recorded import Tell, silent

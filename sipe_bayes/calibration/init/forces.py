@@ -21,7 +21,7 @@ from sipe_bayes.calibration.init.windows import FEW, Source, loaded, trial_of
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.core.units import find_unit, unit_words
-from sipe_bayes.likelihood.starts.estimates import estimate_states
+from sipe_bayes.likelihood import estimate_states
 from sipe_bayes.simulation.simulator import Simulator
 
 _FOLLOWS = 0.3  # share of variance from which a column is the force of a drive, whose gains may be off

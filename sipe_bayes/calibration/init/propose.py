@@ -51,8 +51,7 @@ from sipe_bayes.envs.internal.closed_chains import dependent_joints
 from sipe_bayes.envs.internal.resting import resting_joints
 from sipe_bayes.envs.poses import has_pose, is_round
 from sipe_bayes.inference.recorded import Tell, silent
-from sipe_bayes.likelihood.binding import wants_state_space
-from sipe_bayes.likelihood.starts.estimates import estimate_states
+from sipe_bayes.likelihood import StateSpace, default_likelihood, estimate_states
 
 _PASSED = 300  # states of each log, of which it is looked what they touch
 _LOOKED_AT = 3  # logs that are simulated
@@ -386,7 +385,7 @@ def _window(machine: Machine, logs: Sequence[Trajectory], trial: Trial) -> tuple
 
     At most a fifth of a log, so that its held-out quarter is longer. None where bodies strike: ``state_space``.
     """
-    if wants_state_space(trial.simulator, logs):
+    if isinstance(default_likelihood(trial.simulator, logs), StateSpace):
         return None, "bodies strike or slip along the logs"
     durations = [len(log) * log.dt for log in logs]
     if max(durations) <= _SHORT:

@@ -18,8 +18,7 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.rotations import bridged, written_near
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.starts.estimates import estimate_states
-from sipe_bayes.likelihood.starts.history import with_history
+from sipe_bayes.likelihood import estimate_states, with_history
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import moved
 

@@ -22,8 +22,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, MISFIT, ProbedLogs, oddness, remembering
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
+from sipe_bayes.likelihood import Noise
 from sipe_bayes.posterior import Particles
 
 
@@ -65,31 +64,21 @@ class Causes:
     def of(cls, logs: ProbedLogs, options: CauseOptions = CAUSES) -> Causes:
         """In turns with the noise."""
         windows, n = logs.windows, logs.windows.num_theta
-        pull = -windows.start_precision * logs.starts
         noise, memory = logs.noise, logs.memory
-        span = float(windows.dt.min()), windows.trajectories.longest
         usable = np.array([not probe.by_log for probe in logs.probes], bool)
         prior, prior_pull = FLAT_PRECISION * np.eye(logs.count), np.zeros(logs.count)
         prior[:n, :n], prior_pull[:n] = logs.inner, logs.pull
         for _ in range(options.rounds):
             normal = logs.rows.normal(logs.residual, remembering(noise, memory))
-            arrow = eliminate_starts(normal, logs.count, windows.start_precision, pull)
+            arrow = windows.eliminate(normal, logs.count, logs.starts)
             precision, gradient = arrow.precision + prior, arrow.gradient + prior_pull
             alpha = sparse(precision, gradient, n, usable, logs.one_sided, options)
             kept = np.flatnonzero(np.isfinite(alpha))
             columns = np.concatenate([np.arange(n), n + kept])
             among, beliefs = np.ix_(columns, columns), np.diag(np.concatenate([np.zeros(n), alpha[kept]]))
             covariance = np.linalg.inv(precision[among] + beliefs)
-            pulls = Pulls(
-                beliefs + prior[among],
-                prior_pull[columns],
-                windows.start_precision,
-                pull,
-                np.ones(len(columns), bool),
-            )
-            noise = estimate_noise(
-                logs.moments(columns), noise, pulls, windows.fixed_sd, logs.coloured, *span, windows.scales
-            )
+            pulls = windows.pulls(beliefs + prior[among], prior_pull[columns], logs.starts)
+            noise = windows.estimate_noise(windows.moments(logs.lin(columns)), noise, pulls, logs.coloured)
             noise = Noise(np.maximum(noise.sd, windows.rounding), noise.tau)
             step = covariance @ gradient[columns]
             whole = np.zeros(logs.count)
@@ -106,9 +95,7 @@ class Causes:
 
     def explain(self, logs: ProbedLogs, seed: int) -> bool:
         """Whether what they leave passes for noise, by the null of the check of the residuals."""
-        pull = -logs.windows.start_precision * logs.starts
-        normal = logs.rows.normal(logs.residual, self.noise)
-        arrow = eliminate_starts(normal, logs.count, logs.windows.start_precision, pull)
+        arrow = logs.windows.eliminate(logs.rows.normal(logs.residual, self.noise), logs.count, logs.starts)
         step = np.concatenate([self.step[: logs.windows.num_theta], self.sizes(logs)])
         seen = logs.whiteness(logs.left(logs.residual, step, arrow.blocks(step)), self.noise)
         null = logs.null(seed, MISFIT.simulated)[:, len(logs.probes) :]

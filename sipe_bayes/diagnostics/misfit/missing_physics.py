@@ -34,8 +34,7 @@ from sipe_bayes.diagnostics.misfit.library_discrepancy import library_discrepanc
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances, named, untold, widened
 from sipe_bayes.inference.random_effects import LogEstimate, random_effects
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.windows import Linearisation
+from sipe_bayes.likelihood import Linearisation, Noise
 from sipe_bayes.posterior import Particles, Posterior
 
 

@@ -27,14 +27,8 @@ from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.diagnostics.misfit.whitened_rows import Products, WhitenedRows
-from sipe_bayes.diagnostics.thinning import spread_windows
 from sipe_bayes.inference.recorded import Tell, silent
-from sipe_bayes.likelihood.block_tridiagonal import Eliminated
-from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import Noise, coefficients, whiten
-from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
-from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise
-from sipe_bayes.likelihood.windows import Linearisation, Windows
+from sipe_bayes.likelihood import BoundLikelihood, Eliminated, Linearisation, Noise, QuadraticPrior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.probes import probes, probes_cost
@@ -105,7 +99,7 @@ class _Null:
     rows: list[FloatArray] = field(default_factory=list)
 
 
-def steps_of(windows: Windows, theta: FloatArray) -> int:
+def steps_of(windows: BoundLikelihood, theta: FloatArray) -> int:
     """Control steps of the windows that are probed: so many that all probes together stay within their cost."""
     if isinstance(windows.simulator, CallableSimulator):
         return MISFIT.steps
@@ -136,7 +130,7 @@ class ProbedLogs:
 
     def __init__(
         self,
-        windows: Windows,
+        windows: BoundLikelihood,
         theta: FloatArray,
         noise: Noise,
         starts: FloatArray | None = None,
@@ -146,10 +140,10 @@ class ProbedLogs:
         kept: Kept = NOTHING_KEPT,
         extensions: Sequence[Extension] | None = None,
     ) -> None:
-        some = spread_windows(windows, steps_of(windows, theta))
+        some = windows.spread_over(steps_of(windows, theta))
         if len(some) < windows.num_windows:
             windows, starts = windows.part(some), None if starts is None else starts[some]
-            lin = None if lin is None else Linearisation(lin.residual[some], lin.jacobian[some], lin.valid)
+            lin = None if lin is None else lin.part(some)
         starts = best_starts(windows, theta, noise) if starts is None else starts
         prior = QuadraticPrior(theta, np.zeros((len(theta), len(theta)))) if prior is None else prior
         self.windows, self.theta, self.noise = windows, theta, noise
@@ -166,7 +160,7 @@ class ProbedLogs:
         self.coloured = bool((noise.tau > 0).any())
         self.inner = prior.precision + FLAT_PRECISION * np.eye(n)
         self.free, self.pull = np.ones(n, bool), prior.pull(theta)
-        self.rows = WhitenedRows(self.jacobian, windows.num_start, windows.sequences)
+        self.rows = WhitenedRows(self.jacobian, windows)
         total = self.arrow.gradient[:n] + self.pull
         self._nulls: dict[int, _Null] = {}
         self.free = ~(((theta <= _PRESSED) & (total < 0)) | ((theta >= 1 - _PRESSED) & (total > 0)))
@@ -174,8 +168,7 @@ class ProbedLogs:
     @functools.cached_property
     def arrow(self) -> Eliminated:
         """Normal equations of theta and probes (N + K) at the fit's noise, the windows' starts eliminated."""
-        normal, starts = self.rows.normal(self.residual, self.noise), self.windows.no_starts()
-        return eliminate_starts(normal, self.count, self.windows.start_precision, starts)
+        return self.windows.eliminate(self.rows.normal(self.residual, self.noise), self.count)
 
     @functools.cached_property
     def seen(self) -> Solved:
@@ -229,14 +222,19 @@ class ProbedLogs:
 
     def _statistics(self, draws: FloatArray, kept: Kept) -> _Statistics:
         """Of residuals (W, L, C, S), each with the noise that is estimated in it."""
-        solved = (self.solved(draws[..., s], self.estimated(m)) for s, m in enumerate(self.together(draws)))
-        return _Statistics(np.stack([one.statistics for one in solved]))
+        windows, n, rows = self.windows, self.windows.num_theta, []
+        pulls = windows.pulls(self.inner, np.zeros(n), windows.no_starts(), self.free)
+        jacobian = np.concatenate([self.jacobian[..., :n], self.jacobian[..., self.count :]], axis=-1)
+        for s, moments in enumerate(windows.moments_of_each(draws, jacobian)):
+            noise = windows.estimate_noise(moments, self.noise, pulls, self.coloured)
+            rows.append(self.solved(draws[..., s], noise).statistics)
+        return _Statistics(np.stack(rows))
 
     def drawn(self, rng: np.random.Generator, simulated: int) -> FloatArray:
         """Residuals (W, L, C, S) of the noise alone."""
         out = np.zeros((*self.residual.shape, simulated))
         for c, s in enumerate(self.windows.sequences):
-            a = coefficients(s.gaps, float(self.noise.tau[c]))[s.gap]
+            a = s.coefficients(float(self.noise.tau[c]))
             flat = rng.standard_normal((len(s.index), simulated)) * np.sqrt(1 - a**2)[:, None]
             for i in np.flatnonzero(a):
                 flat[i] += a[i] * flat[i - 1]
@@ -255,26 +253,11 @@ class ProbedLogs:
         nothing = (0.0,) * self.windows.num_theta
         return np.array([probe.trade or nothing for probe in self.probes]).reshape(-1, len(nothing))
 
-    def moments(self, columns: IntArray) -> Moments:
-        """Products of the logs' own residual with some columns of theta and probes, and the starts."""
+    def lin(self, columns: IntArray) -> Linearisation:
+        """The logs' own residual with some columns of theta and probes, and the starts."""
         starts = np.arange(self.count, self.jacobian.shape[-1])
         jacobian = self.jacobian[..., np.concatenate([columns, starts])]
-        return Moments(self.residual, jacobian, len(columns), self.windows.sequences)
-
-    def together(self, residuals: FloatArray) -> list[Moments]:
-        """For each of residuals (W, L, C, S) its products with theta and the starts."""
-        n, many = self.windows.num_theta, residuals.shape[-1]
-        rows = np.concatenate([self.jacobian[..., :n], residuals, self.jacobian[..., self.count :]], axis=-1)
-        whole = Moments(np.zeros(rows.shape[:3]), rows, n + many, self.windows.sequences)
-        starts = n + many + np.arange(2 * self.windows.num_start)
-        return [_chosen(whole, np.concatenate([np.arange(n), starts, [n + s]]), n) for s in range(many)]
-
-    def estimated(self, moments: Moments) -> Noise:
-        """The noise that a fit would have found in a draw of it."""
-        windows = self.windows
-        pulls = Pulls(self.inner, np.zeros(moments.num_theta), windows.start_precision, windows.no_starts(), self.free)
-        span = float(windows.dt.min()), windows.trajectories.longest
-        return estimate_noise(moments, self.noise, pulls, windows.fixed_sd, self.coloured, *span, windows.scales)
+        return Linearisation(self.residual, jacobian, True)
 
     def solved(self, residual: FloatArray, noise: Noise, pull: FloatArray | None = None) -> Solved:
         """Statistics of a residual, with what they are made of.
@@ -287,7 +270,7 @@ class ProbedLogs:
         windows, n = self.windows, self.windows.num_theta
         made = self.rows.products(residual, noise, n)
         # information of theta and probes with the starts eliminated; inverted among the parameters that are free
-        arrow = eliminate_starts(made.normal, n, windows.start_precision, windows.no_starts())
+        arrow = windows.eliminate(made.normal, n)
         probed = _eliminated(arrow, made, n)
         inverse, among = np.zeros((n, n)), np.ix_(self.free, self.free)
         inverse[among] = np.linalg.inv((arrow.precision + self.inner)[among])
@@ -322,8 +305,7 @@ class ProbedLogs:
 
     def white(self, residual: FloatArray, noise: Noise) -> list[FloatArray]:
         """Each channel of a residual (W, L, C), whitened."""
-        rows = zip(np.moveaxis(residual, -1, 0), self.windows.sequences, noise.sd, noise.tau, strict=True)
-        return [whiten(channel.reshape(-1), s, float(sd), float(tau)) for channel, s, sd, tau in rows]
+        return [rows[0] for rows in self.windows.whitened(residual[None], noise)]
 
 
 @dataclass(frozen=True)
@@ -345,15 +327,6 @@ def _eliminated(arrow: Eliminated, made: Products, n: int) -> _Eliminated:
     explained = (flat * arrow.solve(flat)).sum(0) if d else np.zeros(k)
     cross = plain[:n] - arrow.slope.reshape(len(flat), n).T @ flat
     return _Eliminated(plain[-1] - arrow.shift.ravel() @ flat, made.squares - explained, cross)
-
-
-def _chosen(moments: Moments, columns: IntArray, num_theta: int) -> Moments:
-    """Moments of some columns [theta | x_w | x_{w-1} | r] of others; the first ``num_theta`` are theta's."""
-    part, width = copy.copy(moments), moments.num_theta + 2 * moments.num_start + 1
-    products = moments.products.reshape(-1, moments.windows, width, width)
-    products = products.take(columns, axis=-1).take(columns, axis=-2)
-    part.products, part.num_theta = products.reshape(len(products), -1), num_theta
-    return part
 
 
 def remembering(noise: Noise, memory: FloatArray) -> Noise:

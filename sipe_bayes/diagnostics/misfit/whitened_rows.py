@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.likelihood.noise import Noise, coefficients
-from sipe_bayes.likelihood.sequences import Sequence
+from sipe_bayes.likelihood import BoundLikelihood, Noise
 
 
 @dataclass(frozen=True)
@@ -36,14 +35,13 @@ class WhitenedRows:
 
     Args:
         jacobian: (W, L, C, N + K + D).
-        num_start: D.
-        all_sequences: the samples of each channel in a row.
+        windows: the logs, whose samples follow one another.
     """
 
-    def __init__(self, jacobian: FloatArray, num_start: int, all_sequences: list[Sequence]) -> None:
-        self.shape, self.num_theta = jacobian.shape[:3], jacobian.shape[-1] - num_start
-        self.sequences = all_sequences
-        self._crosses = self._placed([s.crosses.astype(float) for s in all_sequences]) > 0
+    def __init__(self, jacobian: FloatArray, windows: BoundLikelihood) -> None:
+        self.shape, self.num_theta = jacobian.shape[:3], jacobian.shape[-1] - windows.num_start
+        self.sequences = windows.sequences
+        self._crosses = self._placed([s.crosses.astype(float) for s in self.sequences]) > 0
         self._rows, self._before = self._both(jacobian)
 
     def normal(self, residual: FloatArray, noise: Noise) -> FloatArray:
@@ -62,7 +60,7 @@ class WhitenedRows:
         """Rows (W, C L, N + K), and (W, C L, 2 D + 1) of [x_w | x_{w-1} | r]; zero where nothing was observed."""
         n, weights, lags = self.num_theta, [], []
         for s, sd, tau in zip(self.sequences, noise.sd.tolist(), noise.tau.tolist(), strict=True):
-            a = coefficients(s.gaps, tau)[s.gap]
+            a = s.coefficients(tau)
             weights.append(1 / (sd * np.sqrt(1 - a**2)))
             lags.append(a * weights[-1])
         weight, lag = self._placed(weights)[..., None], self._placed(lags)[..., None]

@@ -35,7 +35,7 @@ from sipe_bayes.inference.amortised.held_back import HeldBackOptions
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling, PriorSamplingOptions, PriorSamplingState
 from sipe_bayes.inference.amortised.simulations import Simulations
 from sipe_bayes.inference.amortised.summaries import REGRESSED, Summaries
-from sipe_bayes.likelihood.noise import noise_level
+from sipe_bayes.likelihood import noise_level
 from sipe_bayes.models.sbi_tools import import_sbi, seeded
 from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.posterior.flow import to_cube, to_line

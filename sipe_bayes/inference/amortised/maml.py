@@ -44,7 +44,7 @@ from sipe_bayes.inference.amortised.prior_sampling import (
 )
 from sipe_bayes.inference.amortised.simulations import Simulations
 from sipe_bayes.inference.recorded import digest
-from sipe_bayes.likelihood.settings import BudgetExhausted
+from sipe_bayes.likelihood import BudgetExhausted
 from sipe_bayes.models.training import (
     EarlyStopping,
     TrainedNetwork,

@@ -44,3 +44,18 @@ mean lies beyond it, and the truncated density is right up to the bound.
 - Whether the posterior is normal is not asked of segments through impacts, where residuals are as small as rounding,
   or where the fit did not converge. Where initial states are estimated it is only asked whether it is wider.
 """
+
+from typing import TYPE_CHECKING
+
+from sipe_bayes.core.lazy import exports
+
+if TYPE_CHECKING:
+    from sipe_bayes.inference.laplace.estimator import Laplace as Laplace
+    from sipe_bayes.inference.laplace.estimator import TargetFit as TargetFit
+    from sipe_bayes.inference.laplace.estimator import noise_diagnostics as noise_diagnostics
+    from sipe_bayes.inference.laplace.estimator import target_fit as target_fit
+    from sipe_bayes.inference.laplace.estimator import target_of as target_of
+    from sipe_bayes.inference.laplace.options import EVIDENCE_TUNING as EVIDENCE_TUNING
+    from sipe_bayes.inference.laplace.target import Target as Target
+else:
+    __getattr__, __dir__ = exports(__name__)

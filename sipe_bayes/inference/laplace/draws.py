@@ -21,9 +21,9 @@ from sipe_bayes.inference import importance
 from sipe_bayes.inference.importance import Draws
 from sipe_bayes.inference.laplace.optimum import WindowOptimum
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, mixture
-from sipe_bayes.inference.laplace.target import WindowFit, WindowTarget, value_cost
+from sipe_bayes.inference.laplace.target import WindowFit, WindowTarget
 from sipe_bayes.inference.stretches import look_size, proposals, stretches
-from sipe_bayes.likelihood.settings import BudgetExhausted
+from sipe_bayes.likelihood import BudgetExhausted
 from sipe_bayes.likelihood.windows import Windows
 
 
@@ -57,7 +57,7 @@ def look_beyond(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum
     asked = tuning.wanted and windows.settings.noise != "sandwich" and not windows.impacts
     if not asked or (len(shared) > 1 and windows.num_start):
         return Look()
-    n, cost, single = len(problem.space), value_cost(windows), len(shared) == 1
+    n, cost, single = len(problem.space), 2 if windows.num_start else 1, len(shared) == 1
     # elsewhere the slope of starts at an optimum may be steep; from half of the range on it is none
     open_sd = max(np.sqrt(np.diag(one.covariance)).max() for one in shared) > 0.5
     probes = len(shared) * importance.probe_size(n) if not windows.num_start or open_sd else 0
@@ -94,7 +94,7 @@ def _draw(
     """Draws from normals (mean, covariance) ``first``, then from those of the draws, as long as these promise more."""
     tuning, normals, n = problem.options.tuning.importance, mixture(shared, problem.space), len(problem.space)
     draws, highest = Draws.none(n), None
-    cost = value_cost(windows) * (importance.batch_size(n, tuning) + len(shared))
+    cost = 2 if windows.num_start else 1 * (importance.batch_size(n, tuning) + len(shared))
     while windows.has_room(cost):
         if draws.batches < len(first):
             mean, covariance = first[draws.batches]

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
@@ -31,12 +31,13 @@ from sipe_bayes.inference.laplace.state_space.several_linearisations import line
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, contradiction
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
+from sipe_bayes.inference.laplace.target import Target, WindowFit, WindowTarget
+from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, FitResult, Noise, StateSpace
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
-from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall, StateSpace
 from sipe_bayes.likelihood.starts.estimates import contacts_of
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
-from sipe_bayes.posterior import GaussianMixture
+from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.simulation.simulator import Simulator
 
 
@@ -288,9 +289,8 @@ class Laplace(Estimator[LaplaceState]):
     def _report(self, kept: list[Optimum], state: LaplaceState, count: int, effective: float) -> None:
         """Diagnostics of the best optimum, and whether its normal, or ``count`` draws, are the posterior."""
         best, search = kept[0], state.search
-        self.diagnostics = {"modes": len(kept), "noise_sd": best.sd.tolist(), "noise_tau": best.tau.tolist()}
+        self.diagnostics = {"modes": len(kept), **noise_diagnostics(best)}
         if isinstance(best, ChainOptimum):
-            self.diagnostics |= best.diagnostics()
             self.diagnostics["pareto_k"] = [one.pareto_k for one in state.judgements]
             if not best.settled:
                 self.find(Code.PROCESS_NOISE_UNSETTLED)
@@ -339,19 +339,6 @@ class Laplace(Estimator[LaplaceState]):
             if optimum.finding is not None:
                 self.findings.add(optimum.finding)
 
-    def fitted_states(self, trajectories: Trajectories) -> FloatArray | None:
-        """States (R, T+1, S) of the logs of ``fit`` at the best optimum of a ``StateSpace``; of windows None.
-
-        Beyond a shorter log's end they stay where they are.
-        """
-        best = self._best
-        if not isinstance(best, ChainOptimum):
-            return None
-        length = trajectories.length
-        ends = np.cumsum(length + 1)
-        sample = np.minimum(np.arange(int(length.max()) + 1), length[:, None])
-        return np.asarray(best.states[(ends - length - 1)[:, None] + sample])
-
     def usual_rest(self) -> float | None:
         """Rollouts that the fit still takes as a rule; None where nothing is known of that."""
         state, bound = self.state, self._bound
@@ -363,30 +350,66 @@ class Laplace(Estimator[LaplaceState]):
         return SegmentSolver(self.problem, self.windows(bound[0])).usual_rest(state.search)
 
     @property
-    def wild(self) -> IntArray:
-        """Samples (k, 3) that ``fit`` left out, by log, number in it and channel; see ``likelihood.wild_samples``."""
-        search = None if self.state is None else self.state.search
-        return search.wild if isinstance(search, WindowState) else np.zeros((0, 3), np.int64)
-
-    def fitted_starts(self, theta: FloatArray) -> FloatArray | None:
-        """Starts (W, D) of the windows of ``fit`` as the best optimum has them at theta (N,); of a chain None."""
-        best = self._best
-        if not isinstance(best, WindowOptimum):
-            return None
-        return np.asarray(best.starts - best.slope @ (theta - best.theta))
-
-    @property
-    def _best(self) -> Optimum | None:
+    def best(self) -> Optimum | None:
+        """The best optimum until now, None before one."""
         kept = [] if self.state is None else distinct(self.state.search.optima)
         return kept[0] if kept else None
 
+    @property
+    def result(self) -> FitResult | None:
+        """The best optimum until now, None before one."""
+        best, starts, slope, states, finding = self.best, None, None, None, None
+        if best is None:
+            return None
+        assert self.state is not None
+        search = self.state.search
+        outliers = search.wild if isinstance(search, WindowState) else np.zeros((0, 3), np.int64)
+        if isinstance(best, WindowOptimum):
+            starts, slope, finding = best.starts, best.slope, best.finding
+        elif isinstance(best, ChainOptimum) and self._bound is not None:
+            length = self._bound[0].length
+            sample = np.minimum(np.arange(int(length.max()) + 1), length[:, None])
+            states = np.asarray(best.states[(np.cumsum(length + 1) - length - 1)[:, None] + sample])
+        noise = Noise(best.sd, best.tau)
+        return FitResult(
+            best.theta, best.centre, best.spread, noise, best.evidence, starts, slope, states, outliers, finding
+        )
+
     def information(self) -> tuple[FloatArray, FloatArray]:
         """Optimum (N,), perhaps outside the cube, and information (N, N) of the data alone, after ``fit``."""
-        if self._best is None:
+        if self.best is None:
             raise ValueError("information: nothing has been fitted yet; call fit first")
-        prior, mean, total = QuadraticPrior.of(self.prior), self._best.centre, np.linalg.inv(self._best.spread)
+        prior, mean, total = QuadraticPrior.of(self.prior), self.best.centre, np.linalg.inv(self.best.spread)
         flat = FLAT_PRECISION * np.eye(len(mean))
         eigenvalues, axes = np.linalg.eigh(total - prior.precision - flat)
         information = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T
         right = total @ mean - prior.precision @ prior.mean - flat @ np.full(len(mean), 0.5)
         return np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ right, information  # else a direction is open
+
+
+TargetFit = WindowFit | ChainFit
+"""What a target is made of, as plain data."""
+
+
+def target_fit(bound: Windows | Chain, optimum: Optimum) -> TargetFit:
+    """What the target at an optimum is made of; simulates."""
+    if isinstance(bound, Chain):
+        assert isinstance(optimum, ChainOptimum)
+        return ChainFit.at(bound, optimum)
+    assert isinstance(optimum, WindowOptimum)
+    return WindowFit.at(bound, optimum)
+
+
+def target_of(prior: Posterior, bound: Windows | Chain, fit: TargetFit) -> Target:
+    """Log p(theta | y) as an optimum has it, initial states or states integrated out."""
+    if isinstance(bound, Chain):
+        assert isinstance(fit, ChainFit)
+        return ChainTarget(prior, bound, fit)
+    assert isinstance(fit, WindowFit)
+    return WindowTarget(prior, bound, fit)
+
+
+def noise_diagnostics(optimum: Optimum) -> dict[str, list[float] | list[int]]:
+    """The noise at an optimum, as plain data."""
+    noise: dict[str, list[float] | list[int]] = {"noise_sd": optimum.sd.tolist(), "noise_tau": optimum.tau.tolist()}
+    return noise | optimum.diagnostics() if isinstance(optimum, ChainOptimum) else noise

@@ -20,8 +20,7 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.optimum import WindowOptimum, WindowState
 from sipe_bayes.inference.laplace.solver import SegmentSolver
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
+from sipe_bayes.likelihood import BudgetExhausted, Segments, bind
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import tangents

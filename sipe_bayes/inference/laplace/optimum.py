@@ -16,19 +16,17 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.findings import Finding
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, StrategyState
-from sipe_bayes.likelihood.block_tridiagonal import Eliminated
+from sipe_bayes.likelihood import Eliminated, Linearisation, Noise
 from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import Noise, pooled
+from sipe_bayes.likelihood.noise import pooled
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior, free_to_move
 from sipe_bayes.likelihood.restricted import (
     Pulls,
-    eliminate_starts,
-    estimate_noise,
     noise_cloud,
     restricted,
     sandwich,
 )
-from sipe_bayes.likelihood.windows import Linearisation, Windows
+from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 
 _SAME_NOISE = 0.03  # relative: a change of an sd that moves no optimum
@@ -52,7 +50,7 @@ def pulls(windows: Windows, prior: QuadraticPrior, theta: FloatArray, starts: Fl
     """Priors and bounds at theta (N,) and starts (W, D); force (N,) of the data may press theta against a bound."""
     pull, precision = prior.pull(theta), prior.precision + FLAT_PRECISION * np.eye(len(theta))
     free = free_to_move(theta, force + pull)
-    return Pulls(precision, pull, windows.start_precision, -windows.start_precision * starts, free)
+    return windows.pulls(precision, pull, starts, free)
 
 
 def present_noise(windows: Windows, residual: FloatArray) -> Noise:
@@ -75,18 +73,10 @@ def updated_noise(
 
     The search for it begins at ``before``; coloured: whether correlation times are estimated.
     """
-    start_pull = -windows.start_precision * starts
-    solved = eliminate_starts(moments.normal(before), moments.num_theta, windows.start_precision, start_pull)
-    context = pulls(windows, prior, theta, starts, solved.gradient)
-    noise = estimated(windows, moments, before, context, coloured)
+    solved = windows.eliminate(moments.normal(before), moments.num_theta, starts)
+    noise = windows.estimate_noise(moments, before, pulls(windows, prior, theta, starts, solved.gradient), coloured)
     sd = np.where(np.isnan(windows.fixed_sd), np.maximum(noise.sd, windows.rounding), noise.sd)
     return Noise(sd, noise.tau)
-
-
-def estimated(windows: Windows, moments: Moments, before: Noise, context: Pulls, coloured: bool) -> Noise:
-    """``likelihood.restricted.estimate_noise`` of windows."""
-    shortest, longest = float(windows.dt.min()), windows.trajectories.longest
-    return estimate_noise(moments, before, context, windows.fixed_sd, coloured, shortest, longest, windows.scales)
 
 
 def beyond_rounding(windows: Windows, noise: Noise) -> Noise:
@@ -197,9 +187,9 @@ def summarised(
 
     moments: of the linearisation ``lin`` there.
     """
-    prior, start_pull = problem.quadratic_prior, -windows.start_precision * starts
+    prior = problem.quadratic_prior
     sandwiched = windows.settings.noise == "sandwich"
-    solved = eliminate_starts(moments.normal(noise), moments.num_theta, windows.start_precision, start_pull)
+    solved = windows.eliminate(moments.normal(noise), moments.num_theta, starts)
     here = pulls(windows, prior, theta, starts, solved.gradient)
     prior_energy = prior.energy(theta) + 0.5 * float((starts**2 @ windows.start_precision).sum())
     evidence = restricted(moments, noise, replace(here, free=np.full(len(theta), True)))[0] - prior_energy
@@ -215,7 +205,7 @@ def summarised(
             centre, spread = problem.normal(theta, *_sandwiched(solved, middle, here.free))
         else:
             point = beyond_rounding(windows, point)
-            inner = eliminate_starts(moments.normal(point), moments.num_theta, windows.start_precision, start_pull)
+            inner = windows.eliminate(moments.normal(point), moments.num_theta, starts)
             centre, spread = problem.normal(theta, inner.precision, inner.gradient)
         mean += weight * centre
         covariance += weight * spread

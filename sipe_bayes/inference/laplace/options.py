@@ -40,6 +40,10 @@ class LaplaceTuning(Options):
     importance: ImportanceTuning = option(ImportanceTuning(), "draws where the posterior is no normal")
 
 
+EVIDENCE_TUNING = LaplaceTuning(solver=SolverTuning(compares=False), importance=ImportanceTuning(wanted=False))
+"""Of fits whose evidences are compared: those of different noise do not compare."""
+
+
 @dataclass(frozen=True)
 class LaplaceOptions(Options):
     """What ``Laplace`` takes beside what every estimator takes."""

@@ -19,8 +19,8 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.inference.laplace.options import LaplaceOptions
+from sipe_bayes.likelihood import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.block_tridiagonal import inverse
-from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.posterior import GaussianMixture, Posterior
 
 

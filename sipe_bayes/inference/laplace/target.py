@@ -24,20 +24,12 @@ import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.inference.laplace.optimum import WindowOptimum, beyond_rounding, estimated, free_noise
-from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.restricted import Pulls, marginal
-from sipe_bayes.likelihood.state_space.chain import Chain
+from sipe_bayes.inference.laplace.optimum import WindowOptimum, beyond_rounding, free_noise
+from sipe_bayes.likelihood import Linearisation, Noise
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Posterior
 
 FORETOLD, FOLLOWED = 1.0, 10.0  # nats: that a step of starts that follow theta promises; by which less than those held
-
-
-def value_cost(windows: Windows | Chain) -> int:
-    """Simulations of the logs that a value of a ``Target`` takes, at most."""
-    return 2 if isinstance(windows, Chain) or windows.num_start else 1
 
 
 @dataclass(frozen=True)
@@ -61,6 +53,8 @@ class Target(ABC):
     """log p(theta | y), starts or states marginalised; a subclass writes the likelihood of one kind of logs."""
 
     prior: Posterior
+    value_cost = 2
+    """Simulations of the logs that a value takes, at most."""
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """Values (B,) of points (B, N), up to a constant; minus infinity outside the cube and where one diverges."""
@@ -90,6 +84,7 @@ class WindowTarget(Target):
 
     def __init__(self, prior: Posterior, windows: Windows, fit: WindowFit) -> None:
         self.prior, self.windows, self.fit = prior, windows, fit
+        self.value_cost = 2 if windows.num_start else 1
         self.noise = Noise(fit.optimum.sd, fit.optimum.tau)
         silent = beyond_rounding(windows, self.noise).sd
         self.silent = bool((silent > self.noise.sd).all())  # residuals of rounding are no evidence
@@ -126,15 +121,13 @@ class WindowTarget(Target):
 
         jacobian: (W, L, C, D), by the starts.
         """
-        windows, nothing = self.windows, np.zeros(0)
-        moments = Moments(residual, jacobian, 0, windows.sequences, windows.settings.noise == "white")
-        noise = self.noise
+        windows, noise = self.windows, self.noise
+        moments = windows.moments(Linearisation(residual, jacobian, True), windows.settings.noise == "white")
         if len(free_noise(windows)):
-            pull = -windows.start_precision * starts
-            context = Pulls(np.zeros((0, 0)), nothing, windows.start_precision, pull, np.zeros(0, bool))
-            noise = estimated(windows, moments, noise, context, windows.settings.noise == "ar1")
+            context = windows.pulls(np.zeros((0, 0)), np.zeros(0), starts)
+            noise = windows.estimate_noise(moments, noise, context, windows.settings.noise == "ar1")
         noise = Noise(np.maximum(noise.sd, self.least_sd), noise.tau)
-        return marginal(moments, noise, starts, windows.start_precision)
+        return windows.log_density(moments, noise, starts)
 
     @property
     def check_cost(self) -> int:

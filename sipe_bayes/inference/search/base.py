@@ -18,9 +18,9 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Recorded, digest
+from sipe_bayes.inference.search.discrepancy import StateDifference, channel_scale
 from sipe_bayes.inference.search.learned_reward import LearnedReward, RewardOptions
-from sipe_bayes.likelihood.discrepancy import StateDifference, channel_scale, simulate
-from sipe_bayes.likelihood.settings import BudgetExhausted, BudgetTooSmall
+from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.models.discriminator import TrainingState
 from sipe_bayes.posterior import Posterior
 
@@ -137,7 +137,7 @@ class Search(Estimator[P]):
         Returns:
             The state with theta in its pool.
         """
-        predicted = simulate(self.windows(trajectories), theta)
+        predicted = self.windows(trajectories).simulate(theta)
         pool, training = self.rewarded(state, predicted, trajectories, most)
         pool = replace(
             pool,

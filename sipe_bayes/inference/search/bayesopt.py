@@ -65,9 +65,8 @@ from sipe_bayes.inference.search.acquisition import (
     ConfidenceBound,
     ExpectedImprovement,
 )
-from sipe_bayes.likelihood.discrepancy import StateDifference, channel_scale, simulate
-from sipe_bayes.likelihood.settings import BudgetExhausted
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.inference.search.discrepancy import StateDifference, channel_scale
+from sipe_bayes.likelihood import BoundLikelihood, BudgetExhausted
 from sipe_bayes.models.gaussian_process import GaussianProcess, fit_gaussian_process
 from sipe_bayes.posterior import IndependentPrior, SurrogatePosterior
 from sipe_bayes.posterior.ensemble import EnsembleOptions
@@ -194,9 +193,9 @@ class BayesOpt(Estimator[BayesOptState]):
         sobol = torch.quasirandom.SobolEngine(len(self.space), scramble=True, seed=seed)
         return self.prior.inverse(sobol.draw(count, dtype=torch.float64)).numpy()
 
-    def _evaluated(self, state: BayesOptState, theta: FloatArray, windows: Windows) -> BayesOptState:
+    def _evaluated(self, state: BayesOptState, theta: FloatArray, windows: BoundLikelihood) -> BayesOptState:
         """The state with the costs of theta (q, N), and independent residuals where a new one is the best."""
-        predicted = simulate(windows, theta)
+        predicted = windows.simulate(theta)
         units = state.units if np.isfinite(state.units).all() else channel_scale(windows, predicted)
         cost = StateDifference(windows, units)(predicted)
         best = int(cost.argmin())

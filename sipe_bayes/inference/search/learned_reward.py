@@ -31,8 +31,7 @@ from torch.nn.functional import logsigmoid
 
 from sipe_bayes.core.arrays import Float32Array, FloatArray
 from sipe_bayes.core.options import Options, option
-from sipe_bayes.likelihood.noise import noise_level
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood, noise_level
 from sipe_bayes.models.discriminator import Discriminator, Training, TrainingState
 from sipe_bayes.models.transitions import control_steps
 
@@ -62,7 +61,7 @@ class LearnedReward:
         ValueError: where fewer than two whole control steps were recorded, as in an observed x of a function.
     """
 
-    def __init__(self, windows: Windows, options: RewardOptions | None = None, seed: int = 0) -> None:
+    def __init__(self, windows: BoundLikelihood, options: RewardOptions | None = None, seed: int = 0) -> None:
         self.windows, self.options, self.seed = windows, options or RewardOptions(), seed
         sd = noise_level(windows.trajectories, windows.settings, windows.simulator)
         self.noise = sd[windows.channels]
@@ -81,7 +80,7 @@ class LearnedReward:
         training.network.standardise.fit(self.recorded)
         return training.state()
 
-    def features(self, predicted: FloatArray | None, unmatched: Windows | None = None) -> Float32Array:
+    def features(self, predicted: FloatArray | None, unmatched: BoundLikelihood | None = None) -> Float32Array:
         """Control steps of simulations.
 
         Args:

@@ -15,12 +15,12 @@ import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.rotations import bridged, inverse, product, quaternions, rotation_vectors, turned
+from sipe_bayes.core.smoothing import filled, smoothed, smoothed_rotations
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.internal.closed_chains import SD, close, dependent_joints, dofs_of
 from sipe_bayes.envs.internal.resting import loose_joints, rest
 from sipe_bayes.envs.internal.states import activations_at_rest, joints_at_rest, own_filters, settle
 from sipe_bayes.envs.poses import PoseReading, has_pose, inertial_joints, is_round
-from sipe_bayes.likelihood.starts.smoothing import filled, smoothed, smoothed_rotations
 from sipe_bayes.likelihood.state_space.indirect_positions import LogSamples, indirect_positions
 from sipe_bayes.likelihood.state_space.inertial import carried, orientations
 from sipe_bayes.simulation.callable_simulator import CallableSimulator

@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
+from sipe_bayes.core.smoothing import filled, smoothed
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.sensing import Sensing, delayed
 from sipe_bayes.likelihood.starts.estimates import are_states, estimate_states, velocity_columns
-from sipe_bayes.likelihood.starts.smoothing import filled, smoothed
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import tangents
 

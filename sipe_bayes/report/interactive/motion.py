@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.evaluate import measured_starts
-from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.starts.estimates import estimate_states
-from sipe_bayes.likelihood.windows import Windows
+from sipe_bayes.likelihood import BoundLikelihood, Segments, estimate_states
 from sipe_bayes.report.video import Motion
 from sipe_bayes.simulation.simulator import Simulator
 
@@ -30,7 +28,7 @@ def motion(
         channel: the one whose signal is drawn.
         label: what stands beside it.
     """
-    windows = Windows(replace(settings, fit=None), simulator, Trajectories.stack(log))
+    windows = BoundLikelihood(replace(settings, fit=None), simulator, Trajectories.stack(log))
     starts = measured_starts(windows, np.stack(list(theta.values())))
     simulated = {}
     for name, one, start in zip(theta, theta.values(), starts, strict=True):

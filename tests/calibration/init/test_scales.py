@@ -23,7 +23,7 @@ from sipe_bayes.calibration.readers.base import LogError
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.settings import StateSpace
+from sipe_bayes.likelihood import StateSpace
 from sipe_bayes.simulation.simulator import Simulator
 
 DRIVE = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody><body name="rod">

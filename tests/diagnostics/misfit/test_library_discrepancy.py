@@ -10,8 +10,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.misfit.library_discrepancy import Columns, DiscrepancyOptions, library_discrepancy
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Noise, Segments
 from sipe_bayes.likelihood.windows import Windows
 from tests.problems.pendulums import log, pendulum
 

@@ -12,9 +12,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.misfit.library_discrepancy import library_discrepancy
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Noise, Segments, bind
 from sipe_bayes.posterior import GaussianMixture
 from tests.problems.pendulums import log, pendulum
 

@@ -14,9 +14,7 @@ from sipe_bayes.diagnostics.misfit.causes import sparse
 from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Noise, Segments, bind
 from sipe_bayes.posterior import prior
 from tests.problems.pendulums import log, pendulum
 

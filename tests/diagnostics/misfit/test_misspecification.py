@@ -21,12 +21,8 @@ from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, follows, outli
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.likelihood import Noise, QuadraticPrior, Replicas, Segments, bind
 from sipe_bayes.likelihood.moments import Moments
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior
-from sipe_bayes.likelihood.replicas import Replicas
-from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.posterior import GaussianMixture, prior
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.pendulums import XML, log, pendulum
@@ -169,7 +165,7 @@ def test_products_formed_together_are_those_formed_one_by_one() -> None:
     made = residuals(0.9)
     draws, n = made.drawn(np.random.default_rng(0), 3), made.windows.num_theta
     kept = np.concatenate([made.jacobian[..., :n], made.jacobian[..., made.count :]], axis=-1)
-    for s, moments in enumerate(made.together(draws)):
+    for s, moments in enumerate(made.windows.moments_of_each(draws, kept)):
         assert moments.num_theta == n
         close(moments.products, Moments(draws[..., s], kept, n, made.windows.sequences).products)
 

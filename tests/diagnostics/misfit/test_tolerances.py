@@ -16,8 +16,7 @@ from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
 from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.diagnostics.misfit.tolerances import EXACT, Tolerances, tolerance_findings, untold, usual
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.noise import Noise
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Noise, Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import Particles, prior
 from sipe_bayes.simulation.simulator import Simulator

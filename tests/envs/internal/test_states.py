@@ -12,7 +12,7 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.internal.states import UNSETTLED, declare_start, filtered_command, filtered_commands, start_sd
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.likelihood import Segments, StateSpace
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator

@@ -11,7 +11,7 @@ from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.inference.amortised.abc import ABC
 from sipe_bayes.inference.amortised.bayessim import BayesSim
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.models.minimum_distance import MinimumDistance
 from sipe_bayes.models.regressed import Regressed
 from sipe_bayes.simulation.callable_simulator import CallableSimulator

@@ -17,7 +17,7 @@ from sipe_bayes.inference.amortised.bayessim import BayesSim
 from sipe_bayes.inference.amortised.prior_sampling import PriorSampling
 from sipe_bayes.inference.amortised.simulations import BLOCK, Cache, Simulations, place_of_invalid
 from sipe_bayes.inference.registry import arguments
-from sipe_bayes.likelihood.starts.estimates import first_states
+from sipe_bayes.likelihood import first_states
 from sipe_bayes.models.mixture_density import MixtureDensity, RandomFourier
 from sipe_bayes.models.statistics import step_statistics
 from sipe_bayes.models.training import Training

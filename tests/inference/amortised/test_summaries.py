@@ -15,7 +15,7 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.amortised.bayessim import BayesSim
 from sipe_bayes.inference.amortised.npe import NPE
 from sipe_bayes.inference.amortised.outside import Outside
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.models.regressed import Regressed, RegressionOfTheta
 from sipe_bayes.models.training import Training
 from sipe_bayes.posterior import Averaged, Flow

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sipe_bayes as sipe
-from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace import Laplace
 from tests.problems.floors import damping_quantiles, floored_log, floored_pendulum
 
 LEVELS = [0.05, 0.5, 0.95]

@@ -11,10 +11,9 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.datasets import acting
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.laplace.optimum import not_followed
-from sipe_bayes.likelihood.settings import Segments
-from sipe_bayes.likelihood.starts.estimates import estimate_states, unmeasured_joints
+from sipe_bayes.likelihood import Segments, estimate_states, unmeasured_joints
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 

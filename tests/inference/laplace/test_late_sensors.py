@@ -11,8 +11,8 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.sensing import Sensing
-from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.likelihood import Segments, StateSpace
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator

@@ -9,9 +9,8 @@ import pytest
 
 import sipe_bayes as sipe
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.inference.laplace import longer_windows
-from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.binding import bind
+from sipe_bayes.inference.laplace import Laplace, longer_windows
+from sipe_bayes.likelihood import bind
 from sipe_bayes.likelihood.windows import Windows
 
 TIP, JOINTS = ["sensor:tip[0]", "sensor:tip[2]"], ["joint:shoulder.position", "joint:elbow.position"]

@@ -8,8 +8,8 @@ import torch
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.likelihood import Segments
 from sipe_bayes.simulation.simulator import Simulator
 
 XML = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>

@@ -9,7 +9,7 @@ from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.simulation.simulator import Simulator
 
 MODEL = """

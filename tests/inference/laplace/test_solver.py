@@ -10,11 +10,10 @@ from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.laplace.options import LaplaceTuning, SolverTuning
 from sipe_bayes.inference.laplace.solver import SegmentSolver, SolverState, spread_segments
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments, bind
 from sipe_bayes.simulation.prompt import PromptSimulator, prompt
 from sipe_bayes.simulation.simulator import Simulator
 

@@ -12,8 +12,8 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.evaluate import measured_starts
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.settings import Segments, StateSpace
+from sipe_bayes.inference.laplace import Laplace
+from sipe_bayes.likelihood import Segments, StateSpace
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.contacts import Contacts, contacts_along, may_touch
 from sipe_bayes.simulation.simulator import Simulator

@@ -7,7 +7,7 @@ import torch
 
 import sipe_bayes as sipe
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.inference.laplace.estimator import Laplace
+from sipe_bayes.inference.laplace import Laplace
 
 SD, SEEN = 0.15, np.array([0.3, 0.6])
 VALLEY = np.log(1.9) / 1.5

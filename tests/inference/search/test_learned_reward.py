@@ -14,9 +14,7 @@ from sipe_bayes.core.checkpoint import load_state, save_state
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.search.learned_reward import LearnedReward, RewardOptions
-from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.discrepancy import simulate
-from sipe_bayes.likelihood.settings import Segments
+from sipe_bayes.likelihood import Segments, bind
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.models.discriminator import Discriminator, Training, TrainingState
 from sipe_bayes.simulation.simulator import Simulator
@@ -60,10 +58,10 @@ def test_the_truth_is_rewarded_above_wrong_thetas() -> None:
     bound = whole_state()
     reward = LearnedReward(bound)
     rng = np.random.default_rng(0)
-    pool = reward.features(simulate(bound, rng.uniform(size=(20, 2))))
+    pool = reward.features(bound.simulate(rng.uniform(size=(20, 2))))
     state = trained(reward, pool, 20)
     wrong = np.array([[0.9, 0.6], [0.3, 0.05], [0.8, 0.1], [0.05, 0.95]])
-    rewards = reward(state, reward.features(simulate(bound, np.concatenate([TRUTH, wrong]))))
+    rewards = reward(state, reward.features(bound.simulate(np.concatenate([TRUTH, wrong]))))
     print(rewards)
     assert (rewards[0] > rewards[1:]).all(), rewards
 
@@ -73,7 +71,7 @@ def test_a_feature_that_stays_still_in_the_recording_tells_nothing_and_stops_not
     bound = whole_state()
     reward = LearnedReward(bound, RewardOptions(discriminator_updates=2))
     reward.recorded[:, 0] = 0.7
-    made = reward.features(simulate(bound, np.random.default_rng(0).uniform(size=(3, 2))))
+    made = reward.features(bound.simulate(np.random.default_rng(0).uniform(size=(3, 2))))
     state = reward.train(trained(reward, made, 1), made)
     rewards = reward(state, made)
     assert np.isfinite(rewards).all(), rewards
@@ -90,9 +88,9 @@ def test_starting_states_and_actions_need_not_match() -> None:
     assert not np.isclose(recorded.actions, other.actions).any((1, 2)).all()
     assert not np.isclose(recorded.measured[:, 0], other.measured[:, 0])[recorded.start > 0].any()
     reward = LearnedReward(recorded)
-    pool = reward.features(simulate(other, np.random.default_rng(0).uniform(size=(20, 2))), other)
+    pool = reward.features(other.simulate(np.random.default_rng(0).uniform(size=(20, 2))), other)
     wrong = np.array([[0.9, 0.6], [0.3, 0.05], [0.8, 0.1]])
-    made = reward.features(simulate(other, np.concatenate([TRUTH, wrong])), other)
+    made = reward.features(other.simulate(np.concatenate([TRUTH, wrong])), other)
     rewards = reward(trained(reward, pool, 20), made)
     print(rewards)
     assert (rewards[0] > rewards[1:] + 0.2).all(), rewards
@@ -126,7 +124,7 @@ def test_noise_of_the_recording_does_not_give_simulations_away() -> None:
         bound = windows(sd, Segments(noise_sd=(sd,)))
         reward = LearnedReward(bound)
         reward.noise = np.array([stated])
-        features = reward.features(simulate(bound, TRUTH))
+        features = reward.features(bound.simulate(TRUTH))
         losses.append(float(reward(trained(reward, features, 10), features)[0]))
     print(losses)
     assert losses[0] > losses[1] + 0.2, losses
@@ -135,7 +133,7 @@ def test_noise_of_the_recording_does_not_give_simulations_away() -> None:
 def test_diverged_simulations_are_rewarded_least() -> None:
     bound = windows()
     reward = LearnedReward(bound)
-    predicted = simulate(bound, np.concatenate([TRUTH, TRUTH]))
+    predicted = bound.simulate(np.concatenate([TRUTH, TRUTH]))
     predicted[1, -1, 3:] = np.nan
     features = reward.features(predicted)
     assert np.isnan(features[1]).all()
@@ -151,7 +149,7 @@ def test_diverged_simulations_are_rewarded_least() -> None:
 def test_training_goes_on_exactly_from_disk(tmp_path: Path) -> None:
     bound = windows()
     reward = LearnedReward(bound, RewardOptions(discriminator_updates=5))
-    features = reward.features(simulate(bound, np.random.default_rng(0).uniform(size=(4, 2))))
+    features = reward.features(bound.simulate(np.random.default_rng(0).uniform(size=(4, 2))))
     once = reward.train(reward.start(), features)
     save_state(tmp_path / "s", once, "x")
     two = reward.train(once, features)

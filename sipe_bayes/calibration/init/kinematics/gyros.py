@@ -16,8 +16,8 @@ import numpy as np
 import scipy.optimize
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.smoothing import smoothed
 from sipe_bayes.core.trajectory import Trajectory
-from sipe_bayes.likelihood.starts.smoothing import smoothed
 
 _ROWS = 300  # samples that are compared
 _APART = 0.04  # s between them, at least

@@ -14,9 +14,9 @@ from sipe_bayes.calibration.init.machine import Machine
 from sipe_bayes.calibration.init.windows import Source, loaded
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.rotations import inverse, product, quaternions, turned
+from sipe_bayes.core.smoothing import smoothed, smoothed_rotations
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.core.units import find_unit
-from sipe_bayes.likelihood.starts.smoothing import smoothed, smoothed_rotations
 
 _UNITS = ("rad/s", "deg/s")
 _NEAR = 0.2  # relative: beyond, a unit is none

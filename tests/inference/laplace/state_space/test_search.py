@@ -236,7 +236,7 @@ def test_quaternions_stay_of_length_one() -> None:
     assert isinstance(optimum, ChainOptimum)
     lengths = np.linalg.norm(optimum.states[:, 1:5], axis=1)
     np.testing.assert_allclose(lengths, 1.0, atol=1e-9)
-    states = estimator.fitted_states(Trajectories.stack(log))
+    states = estimator.result.states
     assert states is not None
     np.testing.assert_array_equal(states[0], optimum.states)
     print(float(posterior.mean[0]), float(posterior.stddev[0]))
