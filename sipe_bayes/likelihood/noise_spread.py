@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg import solve_banded
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.likelihood.moments import Moments
@@ -66,16 +67,12 @@ def noise_cloud(
 def coloured_square(rows: FloatArray, sequence: Sequence, sd: float, tau: float) -> FloatArray:
     """X' V X (N, N) of the rows X (n, N) of one channel, V its residual covariance.
 
-    With V = (W' W)^-1 and W the bidiagonal whitening matrix this is Z' Z, W' Z = X, one backward recursion.
+    With V = (W' W)^-1 and W the bidiagonal whitening matrix this is Z' Z, W' Z = X.
     """
     a = coefficients(sequence.gaps, tau)[sequence.gap]
     scale = sd * np.sqrt(1 - a**2)
-    z = np.empty_like(rows)
-    carried = np.zeros(rows.shape[1])
-    for i in range(len(rows) - 1, -1, -1):
-        z[i] = scale[i] * (rows[i] + carried)
-        carried = a[i] / scale[i] * z[i]
-    return z.T @ z
+    z = solve_banded((0, 1), np.stack([-a / scale, 1 / scale]), rows)
+    return np.asarray(z.T @ z)
 
 
 def sandwich(

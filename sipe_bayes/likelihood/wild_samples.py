@@ -99,13 +99,13 @@ def wild_residuals(windows: Windows, residual: FloatArray) -> IntArray:
         if not np.isfinite(series).all():  # a window diverged
             continue
         steps, within = np.abs(np.diff(series)), np.diff(log) == 0
-        limit = np.maximum(WILD.residual_sds * _scale(steps[within]), least * spread[c])
-        limit = np.maximum(WILD.residual_times * _around(steps), limit)
+        limit = max(WILD.residual_sds * _scale(steps[within]), least * spread[c])
         sample = windows.start[sequence.window] + index % length
         free = ~follows[log[1:], sample[1:]]
         at, wild = np.flatnonzero((steps > limit) & within & free), np.zeros(len(index), bool)
+        at = at[steps[at] > WILD.residual_times * _around(steps, at)]
         moved = np.abs(np.diff(windows.measured[..., c].reshape(-1)[index]))
-        sudden = at[moved[at] > WILD.position_times * _around(moved)[at]]
+        sudden = at[moved[at] > WILD.position_times * _around(moved, at)]
         for number in np.unique(log[at]):
             first, past = np.searchsorted(log, [number, number + 1])
             rows, longest = series[first:past, None], max(int(WILD.longest_share * (past - first)), WILD.longest)
@@ -190,10 +190,10 @@ def _length(rows: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt((rows**2).sum(axis=-1)))
 
 
-def _around(steps: FloatArray) -> FloatArray:
-    """Median (n,) of the steps on both sides of each."""
+def _around(steps: FloatArray, at: IntArray | slice = slice(None)) -> FloatArray:
+    """Median of the steps on both sides of each of steps (n,), or of those ``at``."""
     padded = np.pad(steps, WILD.neighbours, mode="reflect")
-    window = sliding_window_view(padded, 2 * WILD.neighbours + 1)
+    window = sliding_window_view(padded, 2 * WILD.neighbours + 1)[at]
     return np.asarray(np.median(np.delete(window, WILD.neighbours, axis=1), axis=1))
 
 
