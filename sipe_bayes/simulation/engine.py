@@ -190,7 +190,8 @@ class Engine:
     ) -> tuple[FloatArray, FloatArray]:
         """As ``_native``, without firmware."""
         if self.laws:
-            return self.laws.advance(self._punctual, models, start, controls, reads_sensors)
+            late = bool(self.short_delays) and self.short_delays.shares(models)[2].any()
+            return self.laws.advance(self._punctual if late else self._steps, models, start, controls, reads_sensors)
         return self._punctual(models, start, controls, control_spec, reads_sensors)
 
     def _punctual(
