@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
-from sipe_bayes.simulation.law_steps import Steps
+from sipe_bayes.simulation.law_steps import Models, Moved, Steps
 
 _WHOLE = 1 - 1e-9  # of a physics step: MuJoCo's own from here on
 
@@ -89,14 +89,8 @@ class ShortDelays:
         return bool(self.buffers)
 
     def advance(
-        self,
-        steps: Steps,
-        models: Sequence[mujoco.MjModel],
-        start: FloatArray,
-        controls: FloatArray,
-        control_spec: int,
-        reads: bool,
-    ) -> tuple[FloatArray, FloatArray]:
+        self, steps: Steps, models: Models, start: FloatArray, controls: FloatArray, control_spec: int, reads: bool
+    ) -> Moved:
         """States (B, P, S) and sensordata (B, P, D).
 
         Args:
