@@ -5,7 +5,8 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
 
 .. math:: E = \tfrac12 r^\top V^{-1} r + \tfrac12 \sum_w x_w^\top P_x x_w + \tfrac12 (\theta-\mu)^\top P (\theta-\mu)
 
-**Phases**, one step of each is a linearisation and a batch of damped steps (Levenberg, Marquardt):
+**Phases**, one step of each is a linearisation and a damped step (Levenberg, Marquardt), the best of several where the
+first gains less than three quarters of what the linearisation predicts:
 
 1. PLAIN: theta alone, the segments begin as measured, white noise of the residuals' present size. On a part of the
    segments first, then on as many as ``linearised_steps`` allows. Its end is the plain fit, the first answer.
