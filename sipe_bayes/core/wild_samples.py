@@ -76,8 +76,8 @@ def _distance(rows: FloatArray, other: FloatArray) -> FloatArray:
     return np.minimum(plain, np.linalg.norm(rows + other, axis=-1)) if rows.shape[-1] == 4 else plain
 
 
-def around(steps: FloatArray) -> FloatArray:
-    """Median (n,) of the steps on both sides of each."""
+def around(steps: FloatArray, at: IntArray | slice = slice(None)) -> FloatArray:
+    """Median of the steps on both sides of each of steps (n,), or of those ``at``."""
     padded = np.pad(steps, NEIGHBOURS, mode="reflect")
-    neighbours = np.delete(sliding_window_view(padded, 2 * NEIGHBOURS + 1), NEIGHBOURS, axis=1)
+    neighbours = np.delete(sliding_window_view(padded, 2 * NEIGHBOURS + 1)[at], NEIGHBOURS, axis=1)
     return np.asarray(np.median(neighbours, axis=1))

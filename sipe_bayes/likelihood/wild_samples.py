@@ -35,11 +35,11 @@ def wild_residuals(windows: Windows, residual: FloatArray) -> IntArray:
             continue
         log, sample = windows.log[sequence.window], windows.start[sequence.window] + index % residual.shape[1]
         steps, within = np.abs(np.diff(series)), np.diff(log) == 0
-        limit = np.maximum(5.0 * _scale(steps[within]), least * windows.spread[c])
-        limit = np.maximum(6.0 * around(steps), limit)
+        limit = max(5.0 * _scale(steps[within]), least * windows.spread[c])
         at, wild = np.flatnonzero((steps > limit) & within & ~follows[log[1:], sample[1:]]), np.zeros(len(index), bool)
+        at = at[steps[at] > 6.0 * around(steps, at)]
         moved = np.abs(np.diff(windows.measured[..., c].reshape(-1)[index]))
-        sudden = at[moved[at] > 20.0 * around(moved)[at]]
+        sudden = at[moved[at] > 20.0 * around(moved, at)]
         for number in np.unique(log[at]):
             first, past = np.searchsorted(log, [number, number + 1])
             edges = np.flatnonzero(np.diff(sequence.window[first:past]))  # a new initial state moves a residual there

@@ -37,7 +37,7 @@ from torch import Generator, Tensor
 
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior.base import Numbers, Posterior, as_float64
-from sipe_bayes.posterior.truncated_normal import TruncatedNormal, log_interval
+from sipe_bayes.posterior.truncated_normal import TruncatedNormal, interval_quantile, log_interval
 
 _ABOVE_ONE = 0.1  # of the log of a mass: what draws may estimate it too high by
 _MARGINAL_ERROR = 1e-9  # mass that a closed form may leave out
@@ -155,6 +155,10 @@ class GaussianMixture(Posterior):
     def _quantile(self, q: Tensor) -> Tensor:
         if not all(c.closed_form for c in self._components):
             return super()._quantile(q)
+        if len(self._components) == 1:
+            c = self._components[0]
+            ends = -c.mean / c.sd, (1 - c.mean) / c.sd
+            return torch.from_numpy(np.clip(c.mean + c.sd * interval_quantile(*ends, q.numpy()[:, None]), 0, 1))
         low, high = np.zeros((len(q), len(self.space))), np.ones((len(q), len(self.space)))
         for _ in range(60):
             middle = (low + high) / 2

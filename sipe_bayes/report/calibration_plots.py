@@ -20,7 +20,7 @@ from sipe_bayes.diagnostics.records import Residual, Signal
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.posterior import Particles
 from sipe_bayes.report.colours import CHAINS, DEFAULT, HOLDOUT, MEASURED, POSTERIOR, PRIOR, STYLE
-from sipe_bayes.report.drawing import column_of_panels, equal_parts, new_figure, styled, ticks
+from sipe_bayes.report.drawing import column_of_panels, equal_parts, fixed_grid, label_y, new_figure, styled, ticks
 from sipe_bayes.report.legends import line_handle, shade_handle
 from sipe_bayes.report.panels import correlation, draws, marginal_grid, pair_grid, scale, view
 from sipe_bayes.report.posterior_plots import MAX_PAIRS
@@ -183,10 +183,8 @@ def log_figure(
     first = rows[0]
     long = len(first.window_starts) > SIZES.long_windows or len(first.time) > SIZES.long_samples
     figure = new_figure(2.45 * len(rows) + 0.75)
-    ratios = [2.2, 1] if long else None
-    grid = figure.add_gridspec(2 * len(rows), 1 + long, height_ratios=[*heights] * len(rows), width_ratios=ratios)
+    grid = fixed_grid(figure, [*heights] * len(rows), [2.2, 1] if long else [1])
     spans = [(float(first.time[0]), float(first.time[-1])), *([worst_stretch(rows)] if long else [])]
-    labelled: list[Axes] = []
     for column, span in enumerate(spans):
         for i, signal in enumerate([within(row, span) for row in rows] if column else rows):
             above = figure.add_subplot(grid[2 * i, column])
@@ -199,17 +197,17 @@ def log_figure(
             if column:
                 above.set_title("where the error is largest", loc="left")
                 continue
-            above.set_ylabel(with_unit(shortened(signal.channel, 22), signal.unit))
-            below.set_ylabel("error")
-            labelled += [above, below]
+            label_y(above, with_unit(shortened(signal.channel, 22), signal.unit))
+            label_y(below, "error")
             above.set_title(titles.get(signal.channel, ""), loc="right", color="#444444", fontsize=8.5)
         below.set_xlabel("time [s]")
     held_out = first.use == "holdout"
     kind = "held-out log, not used in the fit" if held_out else "training log"
     colour = HOLDOUT if held_out else "#222222"
-    figure.suptitle(f"{shortened(first.log, 60)}: {kind}", color=colour, fontweight="bold")
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
-    figure.align_ylabels(labelled)
+    figure.suptitle(
+        f"{shortened(first.log, 60)}: {kind}", color=colour, fontweight="bold", y=1 - 0.1 / figure.get_figheight()
+    )
+    figure.legend(handles=handles, loc="lower center", ncols=len(handles))
     return figure
 
 
@@ -237,18 +235,17 @@ def residuals(calibration: Calibration) -> list[Figure]:
 
 def _residual_figure(rows: Sequence[Residual]) -> Figure:
     figure = new_figure(1.75 * len(rows) + 0.5)
-    axes = figure.subplots(len(rows), 2, squeeze=False, width_ratios=[2, 1])
+    axes = fixed_grid(figure, [1.0] * len(rows), [2.0, 1.0], 0.45).subplots(squeeze=False)
     for (left, right), row in zip(axes, rows, strict=True):
         left.plot(row.time, row.residual, color=MEASURED, lw=0.7)
         left.axhline(0, color=PRIOR, lw=0.7)
         left.set_xlim(row.time[0], row.time[-1])
-        left.set_ylabel(with_unit("residual", row.unit))
+        label_y(left, with_unit("residual", row.unit))
         left.set_title(f"{shortened(row.log, 36)}: {shortened(row.channel, 24)}", loc="left")
         ticks(left.yaxis, 4)
         _autocorrelation(right, row)
     axes[-1, 0].set_xlabel("time [s]")
     axes[-1, 1].set_xlabel("lag [samples]")
-    figure.align_ylabels(list(axes[:, 0]))
     return figure
 
 

@@ -17,7 +17,9 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.gridspec import GridSpec
 from matplotlib.ticker import Formatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.transforms import ScaledTranslation
 from PIL import Image
 
 from sipe_bayes.report.colours import STYLE
@@ -161,6 +163,23 @@ def new_figure(height: float, width: float = STYLE.width) -> Drawing:
         width: inches.
     """
     return Drawing(figsize=(width, height), dpi=STYLE.dpi, layout="constrained", facecolor="white")
+
+
+def fixed_grid(figure: Figure, heights: Sequence[float], widths: Sequence[float], gap: float = 0.25) -> GridSpec:
+    """Cells in margins of fixed inches, and such a gap between rows: a third of the time that constraints take."""
+    figure.set_layout_engine("none")
+    (width, height), rows = figure.get_size_inches(), len(heights)
+    ends = {"left": 0.85 / width, "right": 1 - 0.08 / width, "bottom": 0.7 / height, "top": 1 - 0.45 / height}
+    between = {"hspace": gap * rows / (height - 1.15 - (rows - 1) * gap), "wspace": 1.3 / width}
+    return figure.add_gridspec(rows, len(widths), height_ratios=heights, width_ratios=widths, **ends, **between)
+
+
+def label_y(ax: Axes, text: str) -> None:
+    """Label a vertical axis in the margin of a ``fixed_grid``."""
+    ax.set_ylabel(text)
+    assert ax.figure is not None
+    margin = ScaledTranslation(-0.62, 0, ax.figure.dpi_scale_trans)
+    ax.yaxis.set_label_coords(0, 0.5, transform=ax.transAxes + margin)
 
 
 def laid_out(figure: Figure, plain: Sequence[Axes]) -> None:

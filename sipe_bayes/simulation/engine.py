@@ -18,7 +18,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.envs.base import Environment
 from sipe_bayes.envs.foreign.quiet import quiet
 from sipe_bayes.simulation.firmware_steps import FirmwareSteps
-from sipe_bayes.simulation.law_steps import LawSteps
+from sipe_bayes.simulation.law_steps import LawSteps, Models, Moved
 from sipe_bayes.simulation.mjdata import Fields
 from sipe_bayes.simulation.short_delays import ShortDelays
 
@@ -171,59 +171,37 @@ class Engine:
             for model in models:
                 model.opt.disableflags = flags
 
-    def _native(
-        self, models: Sequence[mujoco.MjModel], start: FloatArray, controls: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def _native(self, models: Models, start: FloatArray, controls: FloatArray) -> Moved:
         """States (B, P, S) and sensordata (B, P, D) of P physics steps, with controls (B, P, U)."""
         spec, reads = self.environment.control_spec, self.reads_sensors
         if self.firmware:
             return self.firmware.advance(self._lawful, models, start, controls, spec, reads)
         return self._lawful(models, start, controls, spec, reads)
 
-    def _lawful(
-        self,
-        models: Sequence[mujoco.MjModel],
-        start: FloatArray,
-        controls: FloatArray,
-        control_spec: int,
-        reads_sensors: bool,
-    ) -> tuple[FloatArray, FloatArray]:
+    def _lawful(self, models: Models, start: FloatArray, controls: FloatArray, spec: int, reads: bool) -> Moved:
         """As ``_native``, without firmware."""
         if self.laws:
-            return self.laws.advance(self._punctual, models, start, controls, reads_sensors)
-        return self._punctual(models, start, controls, control_spec, reads_sensors)
+            late = bool(self.short_delays) and self.short_delays.shares(models)[2].any()
+            return self.laws.advance(self._punctual if late else self._steps, models, start, controls, reads)
+        return self._punctual(models, start, controls, spec, reads)
 
-    def _punctual(
-        self,
-        models: Sequence[mujoco.MjModel],
-        start: FloatArray,
-        controls: FloatArray,
-        control_spec: int,
-        reads_sensors: bool,
-    ) -> tuple[FloatArray, FloatArray]:
+    def _punctual(self, models: Models, start: FloatArray, controls: FloatArray, spec: int, reads: bool) -> Moved:
         """As ``_native``, without laws."""
         if self.short_delays:
-            return self.short_delays.advance(self._steps, models, start, controls, control_spec, reads_sensors)
-        return self._steps(models, start, controls, control_spec, reads_sensors)
+            return self.short_delays.advance(self._steps, models, start, controls, spec, reads)
+        return self._steps(models, start, controls, spec, reads)
 
-    def _steps(
-        self,
-        models: Sequence[mujoco.MjModel],
-        start: FloatArray,
-        controls: FloatArray,
-        control_spec: int,
-        reads_sensors: bool,
-    ) -> tuple[FloatArray, FloatArray]:
+    def _steps(self, models: Models, start: FloatArray, controls: FloatArray, spec: int, reads: bool) -> Moved:
         """As ``_native``, by ``mujoco.rollout`` alone, with delays as it knows them."""
         batch, steps = controls.shape[:2]
         out = np.empty((batch, steps, self.physics_size))
-        sensors = np.empty((batch, steps, self.model.nsensordata)) if reads_sensors else None
+        sensors = np.empty((batch, steps, self.model.nsensordata)) if reads else None
         self._threads.rollout(
             models,
             self._datas,
             np.ascontiguousarray(start),
             np.ascontiguousarray(controls),
-            control_spec=control_spec,
+            control_spec=spec,
             skip_checks=True,
             nstep=steps,
             state=out,

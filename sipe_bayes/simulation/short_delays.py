@@ -14,8 +14,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.simulation.law_steps import Steps
+from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.simulation.law_steps import Models, Moved, Steps
 
 _WHOLE = 1 - 1e-9  # of a physics step: MuJoCo's own from here on
 
@@ -89,14 +89,8 @@ class ShortDelays:
         return bool(self.buffers)
 
     def advance(
-        self,
-        steps: Steps,
-        models: Sequence[mujoco.MjModel],
-        start: FloatArray,
-        controls: FloatArray,
-        control_spec: int,
-        reads: bool,
-    ) -> tuple[FloatArray, FloatArray]:
+        self, steps: Steps, models: Models, start: FloatArray, controls: FloatArray, control_spec: int, reads: bool
+    ) -> Moved:
         """States (B, P, S) and sensordata (B, P, D).
 
         Args:
@@ -107,11 +101,7 @@ class ShortDelays:
             control_spec: of the controls.
             reads: whether sensordata is wanted.
         """
-        distinct = {id(model): model for model in models}
-        rows = {key: (m.opt.timestep, *m.actuator_delay[self._actuators]) for key, m in distinct.items()}
-        timestep, *delays = np.array([rows[id(model)] for model in models]).T
-        share = np.stack(delays, axis=1) / timestep[:, None]
-        short = (share > 0) & (share < _WHOLE)
+        timestep, share, short = self.shares(models)
         if not short.any():
             return steps(models, start, controls, control_spec, reads)
         inputs = controls.copy()
@@ -120,7 +110,7 @@ class ShortDelays:
             now = controls[here, :, buffer.control]
             before = np.concatenate([buffer.newest(start[here])[:, None], now[:, :-1]], axis=1)
             inputs[here, :, buffer.control] += share[here, j, None] * (before - now)
-        with self._undelayed(list(distinct.values())):
+        with self._undelayed(list({id(model): model for model in models}.values())):
             states, sensors = steps(models, start, inputs, control_spec, reads)
         times = start[:, :1] + np.arange(controls.shape[1]) * timestep[:, None]
         for j, buffer in enumerate(self.buffers):
@@ -129,6 +119,14 @@ class ShortDelays:
             stored(late, buffer.stamped, buffer.values, times[here], commands, timestep[here])
             states[here] = late
         return states, sensors
+
+    def shares(self, models: Sequence[mujoco.MjModel]) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Seconds (B,) of the models' physics steps, their delays (B, K) in steps, and which of these are short."""
+        distinct = {id(model): model for model in models}
+        rows = {key: (m.opt.timestep, *m.actuator_delay[self._actuators]) for key, m in distinct.items()}
+        timestep, *delays = np.array([rows[id(model)] for model in models]).T
+        share = np.stack(delays, axis=1) / timestep[:, None]
+        return timestep, share, (share > 0) & (share < _WHOLE)
 
     @contextmanager
     def _undelayed(self, models: Sequence[mujoco.MjModel]) -> Iterator[None]:

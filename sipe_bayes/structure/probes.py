@@ -90,22 +90,21 @@ class _Change:
     trades: FloatArray
 
 
-def probes_cost(windows: BoundLikelihood, theta: FloatArray) -> int:
+def probes_cost(windows: BoundLikelihood, placed: Sequence[Placed]) -> int:
     """Rollouts that ``probes`` takes, but for extensions that do not go together; at this theta at most."""
-    if not isinstance(windows.simulator.environment, MjcfEnvironment):
-        return 0
-    groups = _groups(_placed(windows, theta, windows.no_starts()))
+    groups = _groups(placed)
     each = (1 + sum(one.probes.shape[0] * one.probes.shape[1] for one in group) for group in groups)
-    return (sum(each) + RUNS) * len(windows.trajectories)
+    return (sum(each) + RUNS) * len(windows.trajectories) if placed else 0
 
 
 def probes(
     windows: BoundLikelihood,
     theta: FloatArray,
     starts: FloatArray,
+    placed: Sequence[Placed],
+    shorter: bool = True,
     tell: Tell = silent,
     kept: Kept = NOTHING_KEPT,
-    extensions: Sequence[Extension] | None = None,
 ) -> tuple[list[Probe], FloatArray, BoolArray]:
     """Probes of extensions, and of a shorter physics step; none where the environment is no user's MJCF.
 
@@ -113,9 +112,10 @@ def probes(
         windows: the logs, W windows of L samples and C channels.
         theta: (N,) where the model stands.
         starts: (W, D) of the windows.
+        placed: the extensions.
+        shorter: whether a shorter physics step is asked as well.
         tell: called with what is being done.
         kept: keeps what extensions do, group by group.
-        extensions: default all that the registry has, and the physics step.
 
     Returns:
         The K probes that change what is observed; their effects (W, L, C, K) on the predictions; and whether the size
@@ -123,11 +123,11 @@ def probes(
     """
     if not isinstance(windows.simulator.environment, MjcfEnvironment):
         return [], np.zeros((*windows.observed.shape, 0)), np.zeros(0, bool)
-    seen = effects(windows, theta, starts, _placed(windows, theta, starts, extensions), tell, kept)
+    seen = effects(windows, theta, starts, placed, tell, kept)
     named = [probe for effect in seen for probe in _named(effect)]
     one_sided = [bounds(effect.placed.plain, effect.probes)[0] >= 0 for effect in seen]
     changes = [np.zeros((*windows.observed.shape, 0)), *(_unit(effect.change) for effect in seen)]
-    if extensions is None and (error := _step_error(windows, theta, starts, tell, kept)) is not None:
+    if shorter and (error := _step_error(windows, theta, starts, tell, kept)) is not None:
         change = error.change[..., None]
         whole = float(_size(change)[0])
         named.append(Probe(PHYSICS_STEP.sentence(WORLD), error.remedy, False, WORLD, PHYSICS_STEP, whole))
@@ -149,10 +149,15 @@ def _step_error(
     return next(iter(kept.of("physics-step", tuple[StepError, ...], made)), None)
 
 
-def _placed(
+def place_extensions(
     windows: BoundLikelihood, theta: FloatArray, starts: FloatArray, extensions: Sequence[Extension] | None = None
 ) -> list[Placed]:
-    """Extensions, by default all that the registry has, but those of last resort, wherever they have a place."""
+    """Extensions, by default all that the registry has, but those of last resort, wherever they have a place.
+
+    Nowhere in an environment that is no user's MJCF.
+    """
+    if not isinstance(windows.simulator.environment, MjcfEnvironment):
+        return []
     machine = machine_of(windows, theta, starts)
     chosen = (get_extension(name) for name in EXTENSIONS) if extensions is None else extensions
     every = (p for extension in chosen for p in placements(extension, machine))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
+from unittest import mock
 
 import mujoco
 import numpy as np
@@ -24,20 +25,15 @@ FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 HORIZON = 40
 NUMBERS = {  # bounds of each number of a law: large against the machines' forces
     "load_friction": (0.0, 0.6),
-    "direction_friction": (-0.4, 0.4),
-    "direction_damping": (-0.2, 0.2),
-    "stribeck_friction": (0.0, 0.8),
+    **dict.fromkeys(("direction_friction", "direction_gain"), (-0.4, 0.4)),
+    **dict.fromkeys(("direction_damping", "force_drop"), (-0.2, 0.2)),
+    **dict.fromkeys(("stribeck_friction", "presliding_friction", "hysteresis_force"), (0.0, 0.8)),
+    **dict.fromkeys(("cogging_sin", "cogging_cos"), (-0.5, 0.5)),
     "stribeck_velocity": (0.05, 2.0),
-    "presliding_friction": (0.0, 0.8),
     "presliding_range": (0.01, 0.2),
-    "hysteresis_force": (0.0, 0.8),
     "hysteresis_range": (0.02, 0.5),
     "supply_sag": (0.0, 0.3),
-    "cogging_sin": (-0.5, 0.5),
-    "cogging_cos": (-0.5, 0.5),
     "cogging_poles": (1.0, 12.0),
-    "force_drop": (-0.2, 0.2),
-    "direction_gain": (-0.4, 0.4),
     "exponent": (0.7, 1.4),
     "exponent_force": (0.5, 2.0),
     "dead_zone": (0.0, 0.5),
@@ -193,6 +189,13 @@ def test_control_steps_of_several_physics_steps_ask_the_laws_in_each() -> None:
     coarse = simulator.rollout(theta, actions[:, ::4], starts, 4 * dt)
     fine = simulator.rollout(theta, actions, starts, dt)
     np.testing.assert_array_equal(coarse.observations, fine.observations[:, ::4])
+
+
+def test_forces_that_do_not_hang_on_the_motion_take_few_calls() -> None:
+    simulator = Simulator(lawful(MACHINES["slide"], LAWS["dead_zone"]))
+    with mock.patch.object(simulator.engine, "_steps", wraps=simulator.engine._steps) as steps:
+        simulator.rollout(*drawn(simulator))
+    assert steps.call_count == 4, "twice a few steps, twice all"
 
 
 def test_friction_of_a_law_leaves_the_models_as_they_were() -> None:

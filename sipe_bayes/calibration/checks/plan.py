@@ -20,7 +20,7 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Progress, Tell
 from sipe_bayes.likelihood import StateSpace, bind
 from sipe_bayes.simulation.base import Simulated
-from sipe_bayes.structure.probes import probes_cost
+from sipe_bayes.structure.probes import place_extensions, probes_cost
 
 S = TypeVar("S")
 
@@ -114,9 +114,8 @@ def plan_of(problem: Problem, method: Estimator) -> Plan:
 
     search = starts_cost(windows)
     try:
-        lacking = (
-            0 if chain or windows.impacts else round(probes_cost(windows, theta) * share(steps_of(windows, theta)))
-        )
+        placed = [] if chain or windows.impacts else place_extensions(windows, theta, windows.no_starts())
+        lacking = round(probes_cost(windows, placed) * share(steps_of(windows, placed)))
     except ValueError:  # the model as given diverges, which the check will say
         lacking = 0
     alone = min(30 * (n + windows.num_start + 2) + 600, LOG_BUDGET) * logs

@@ -157,8 +157,9 @@ def library_discrepancy(
 
     def moved(name: str | None = None) -> FloatArray:
         """Theta (M, N), by all extensions or by one."""
-        own = np.where([name in (None, probe.name) for probe in logs.probes], sizes, 0.0)
-        return np.asarray(logs.traded(np.where(one[:, None], own, 0.0)) - own @ seen.answer.T)
+        some = np.flatnonzero([name in (None, probe.name) for probe in logs.probes])
+        own = sizes[:, some]
+        return np.asarray(logs.traded(np.where(one[:, None], own, 0.0), some) - own @ seen.answer[:, some].T)
 
     square = {name: (moved(name) ** 2).mean(0) / np.maximum(seen.variance, 1e-300) for name in dict.fromkeys(names)}
     most = sorted(square, key=lambda name: -float(square[name].sum()))

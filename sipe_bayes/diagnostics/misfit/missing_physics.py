@@ -84,10 +84,10 @@ def missing_physics(
     numbers = untold(logs, tolerances)
     causes = Causes.of(logs, options)
     nothing = np.zeros(len(logs.probes))
-    further = random_effects(_estimates(logs, parts, logs.noise, logs.memory, nothing), prior, seed).new_log
-    explained = False
+    explained = bool(len(causes.kept)) and causes.explain(logs, seed)
+    if not explained:
+        further = random_effects(_estimates(logs, parts, logs.noise, logs.memory, nothing), prior, seed).new_log
     if len(causes.kept):
-        explained = causes.explain(logs, seed)
         estimates = _estimates(logs, parts, causes.noise, causes.memory, causes.sizes(logs))
         corrected = random_effects(estimates, prior, seed).new_log
         corrected = causes.widened(logs, corrected, np.random.default_rng(seed))

@@ -30,8 +30,8 @@ from sipe_bayes.diagnostics.misfit.whitened_rows import Products, WhitenedRows
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood import BoundLikelihood, Eliminated, Linearisation, Noise, QuadraticPrior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
-from sipe_bayes.structure.extension import Extension
-from sipe_bayes.structure.probes import probes, probes_cost
+from sipe_bayes.structure.extension import Extension, Placed
+from sipe_bayes.structure.probes import place_extensions, probes, probes_cost
 
 FLAT_PRECISION = 1e-6  # keeps information invertible where a direction is open
 _SHORT = 50  # samples, of which no memory is asked
@@ -99,11 +99,11 @@ class _Null:
     rows: list[FloatArray] = field(default_factory=list)
 
 
-def steps_of(windows: BoundLikelihood, theta: FloatArray) -> int:
+def steps_of(windows: BoundLikelihood, placed: Sequence[Placed]) -> int:
     """Control steps of the windows that are probed: so many that all probes together stay within their cost."""
     if isinstance(windows.simulator, CallableSimulator):
         return MISFIT.steps
-    each = max(probes_cost(windows, theta) / len(windows.trajectories), 1.0)
+    each = max(probes_cost(windows, placed) / len(windows.trajectories), 1.0)
     skip = windows.simulator.physics_steps(float(windows.dt.min()))[0]
     return int(min(MISFIT.steps, MISFIT.simulated_steps / (each * skip)))
 
@@ -140,7 +140,8 @@ class ProbedLogs:
         kept: Kept = NOTHING_KEPT,
         extensions: Sequence[Extension] | None = None,
     ) -> None:
-        some = windows.spread_over(steps_of(windows, theta))
+        placed = place_extensions(windows, theta, windows.no_starts() if starts is None else starts, extensions)
+        some = windows.spread_over(steps_of(windows, placed))
         if len(some) < windows.num_windows:
             windows, starts = windows.part(some), None if starts is None else starts[some]
             lin = None if lin is None else lin.part(some)
@@ -152,7 +153,7 @@ class ProbedLogs:
         if not linearisation.valid:
             raise ValueError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
         self.tell, self.kept = tell, kept
-        self.probes, effects, self.one_sided = probes(windows, theta, starts, tell, kept, extensions)
+        self.probes, effects, self.one_sided = probes(windows, theta, starts, placed, extensions is None, tell, kept)
         n = windows.num_theta
         parts = (linearisation.jacobian[..., :n], effects, linearisation.jacobian[..., n:])
         self.residual, self.jacobian = linearisation.residual, np.concatenate(parts, axis=-1)
@@ -243,9 +244,9 @@ class ProbedLogs:
             out[:, :, c] = column.reshape(*self.residual.shape[:2], simulated)
         return out
 
-    def traded(self, sizes: FloatArray) -> FloatArray:
-        """By how much sizes (..., K) of the probes change theta itself (..., N), where they trade with it."""
-        return np.sqrt(np.maximum(sizes, 0.0)) @ self._trades
+    def traded(self, sizes: FloatArray, some: IntArray | slice = slice(None)) -> FloatArray:
+        """By how much sizes (..., K) of the probes, or of ``some``, change theta itself (..., N) that they trade."""
+        return np.sqrt(np.maximum(sizes, 0.0)) @ self._trades[some]
 
     @functools.cached_property
     def _trades(self) -> FloatArray:

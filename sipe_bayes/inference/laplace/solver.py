@@ -5,7 +5,8 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
 
 .. math:: E = \tfrac12 r^\top V^{-1} r + \tfrac12 \sum_w x_w^\top P_x x_w + \tfrac12 (\theta-\mu)^\top P (\theta-\mu)
 
-**Phases**, one step of each is a linearisation and a batch of damped steps (Levenberg, Marquardt):
+**Phases**, one step of each is a linearisation and a damped step (Levenberg, Marquardt), the best of several where the
+first gains less than three quarters of what the linearisation predicts:
 
 1. PLAIN: theta alone, the segments begin as measured, white noise of the residuals' present size. On a part of the
    segments first, then on as many as ``linearised_steps`` allows. Its end is the plain fit, the first answer.
@@ -43,9 +44,11 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum, auto
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -92,69 +95,39 @@ class Stage(StrEnum):
 
 @dataclass(frozen=True)
 class Here:
-    """Where a fit stands.
+    """Where a fit stands; K of the W segments are those of its part."""
 
-    Args:
-        stage: what the next step does.
-        part: which part of the segments is simulated: 0 the smallest.
-        theta: (N,).
-        starts: (W, D), of all segments.
-        noise: as last estimated.
-        damping: of the next step.
-        iteration: steps until now.
-        scale: (N + D,), lengths of the finite differences.
-        axes: (N, N), rows along which theta is changed for them; empty before they are known.
-        residual: (K, L, C), of the part's K segments; None where they are to be simulated.
-        starts_jacobian: (K, L, C, D), kept; None where it is to be taken anew.
-        misfit: of the first residuals, in units of the channels' spread.
-        exact: whether the step before gained what was expected, so that its kept columns still hold.
-        white: whether the noise is white, as the configuration or the comparison asks.
-    """
-
-    stage: Stage
-    part: int
-    theta: FloatArray
-    starts: FloatArray
-    noise: Noise
-    damping: float
-    iteration: int = 0
-    scale: FloatArray = field(default_factory=lambda: np.zeros(0))
-    axes: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    residual: FloatArray | None = None
-    starts_jacobian: FloatArray | None = None
-    misfit: float = 0.0
-    exact: bool = False
-    white: bool = False
+    stage: Stage  # what the next step does
+    part: int  # of the segments that is simulated: 0 the smallest
+    theta: FloatArray  # (N,)
+    starts: FloatArray  # (W, D), of all segments
+    noise: Noise  # as last estimated
+    damping: float  # of the next step
+    iteration: int = 0  # steps until now
+    scale: FloatArray = field(default_factory=lambda: np.zeros(0))  # (N + D,), lengths of the finite differences
+    axes: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # (N, N), rows of theta's; empty at first
+    residual: FloatArray | None = None  # (K, L, C); None where they are to be simulated
+    starts_jacobian: FloatArray | None = None  # (K, L, C, D), kept; None where it is to be taken anew
+    misfit: float = 0.0  # of the first residuals, in units of the channels' spread
+    exact: bool = False  # whether the step before gained what was expected, so that its kept columns still hold
+    white: bool = False  # whether the noise is white, as the configuration or the comparison asks
 
 
 @dataclass(frozen=True)
 class SolverState(WindowState):
-    """A fit of segments.
-
-    Args:
-        plain: (N,), the plain fit from the first starting point; empty before it.
-        compared: whether coloured noise has been held against plain least squares.
-        freed: whether the mode's free-run error has been compared with the plain fit's.
-        wider: by how much coloured residuals make the variance of plain least squares larger than white ones would.
-        scouted: whether further starting points were tried.
-        ends: energies where plain fits of the shortest beginnings ended, of each starting point through impacts.
-        reached: theta (N,) there.
-        rounds: of further draws from the prior that were followed.
-        behind: how many times the plain fit's that error was; 0 where it was not larger.
-        elsewhere: whether another optimum is being looked for, from where plain fits of few segments ended.
-    """
+    """A fit of segments."""
 
     here: Here
-    plain: FloatArray = field(default_factory=lambda: np.zeros(0))
-    compared: bool = False
-    freed: bool = False
-    scouted: bool = False
-    wider: float = 1.0
-    behind: float = 0.0
-    ends: tuple[float, ...] = ()
-    reached: tuple[FloatArray, ...] = ()
-    rounds: int = 0
-    elsewhere: bool = False
+    plain: FloatArray = field(default_factory=lambda: np.zeros(0))  # (N,), from the first starting point; empty before
+    compared: bool = False  # whether coloured noise has been held against plain least squares
+    freed: bool = False  # whether the mode's free-run error has been compared with the plain fit's
+    scouted: bool = False  # whether further starting points were tried
+    wider: float = 1.0  # times the variance of plain least squares that coloured residuals make of a white one
+    behind: float = 0.0  # how many times the plain fit's that error was; 0 where it was not larger
+    ends: tuple[float, ...] = ()  # energies of plain fits of the shortest beginnings, by starting point through impacts
+    reached: tuple[FloatArray, ...] = ()  # theta (N,) there
+    rounds: int = 0  # of further draws from the prior that were followed
+    elsewhere: bool = False  # whether another optimum is being looked for, from where plain fits of few segments ended
 
     @property
     def behind_noise(self) -> bool:
@@ -167,17 +140,11 @@ class SolverState(WindowState):
         return not self.compared and not self.here.white and len(self.plain) > 0
 
 
-@dataclass(frozen=True)
-class _Trial:
-    """The best of a batch of damped steps.
+class _Trial(NamedTuple):
+    """The best of a batch of damped steps, to theta (N,) and starts (K, D), and the residual (K, L, C) there.
 
-    Args:
-        theta: (N,).
-        starts: (K, D).
-        residual: (K, L, C).
-        gained: nats; not above zero where no step lowered the energy.
-        expected: nats that the linearisation promised for the least damped step.
-        damping: of the best.
+    gained: nats, not above zero where no step lowered the energy; expected: of the least damped step, by the
+    linearisation; damping: of the best.
     """
 
     theta: FloatArray
@@ -188,17 +155,11 @@ class _Trial:
     damping: float
 
 
-@dataclass(frozen=True)
-class _PlainStep:
-    """A step of plain least squares.
+class _PlainStep(NamedTuple):
+    """A step of plain least squares: where the fit stands after it, and linearisation and Hessian (N, N) before it.
 
-    Args:
-        after: where the fit stands after it.
-        lin: the linearisation where it began.
-        hessian: (N, N), there.
-        energy: after it.
-        gained: nats; not above zero where no step lowered the energy.
-        stuck: whether none is worth trying any more.
+    energy: after it, nats; gained: not above zero where no step lowered the energy; off: by how much that differs from
+    what the linearisation predicted of the least damped step; stuck: whether none is worth trying any more.
     """
 
     after: Here
@@ -206,22 +167,16 @@ class _PlainStep:
     hessian: FloatArray
     energy: float
     gained: float
+    off: float
     stuck: bool
 
     def ends(self, enough: float) -> bool:
-        """Whether a fit stands still that gains ``enough`` nats or fewer."""
-        return self.stuck or 0 < self.gained <= enough
+        """Whether it, or what the linearisation has left to gain after it, is no more than ``enough`` nats."""
+        return self.stuck or (self.gained > 0 and min(self.gained, self.off) <= enough)
 
 
-@dataclass(frozen=True)
-class _End:
-    """Where plain least squares ended.
-
-    Args:
-        theta: (N,).
-        energy: nats.
-        hessian: (N, N), of the energy.
-    """
+class _End(NamedTuple):
+    """Where plain least squares ended: theta (N,), the energy in nats and its Hessian (N, N)."""
 
     theta: FloatArray
     energy: float
@@ -245,17 +200,19 @@ class SegmentSolver:
     def start(self) -> SolverState:
         """The first state: at the model as given, or at the starting point that the options name."""
         options, nominal = self.problem.options, np.clip(self.problem.space.default_theta, 0, 1)
+        residual, valid = None, True
         if options.initial is not None:
-            points, valid = options.initial, True
+            points = options.initial
         elif self._beginnings and options.restarts > 1 and self._may_screen():
-            points, valid = self.screened(nominal, _THROUGH_IMPACTS)
+            points, residual, valid = self.screened(nominal, _THROUGH_IMPACTS)
         else:
-            points, valid = self.screened(nominal, 0)
+            points, residual, valid = self.screened(nominal, 0)
             if not valid:
-                points = self.screened(nominal, options.candidates)[0][:1]
+                points, residual, _ = self.screened(nominal, options.candidates)
+                points = points[:1]
         if not valid:
             self.problem.find(finding(Code.DIVERGES_AS_GIVEN))
-        return SolverState(points, 0, self._begin(points[0]))
+        return SolverState(points, 0, replace(self._begin(points[0]), residual=residual))
 
     def onward(self, state: WindowState, theta: FloatArray, starts: FloatArray | None = None) -> SolverState | None:
         """A fit that had ended, from a better place (N,) and initial states (W, D); None where it has had enough."""
@@ -365,8 +322,10 @@ class SegmentSolver:
         share = self._view(0)[1].steps.sum() / self.windows.steps.sum()
         return self.windows.has_room(math.ceil(_THROUGH_IMPACTS * share) + 1)
 
-    def screened(self, nominal: FloatArray, draws: int, number: int = 0) -> tuple[FloatArray, bool]:
-        """The best of the nominal model (N,) and draws from the prior, best first; and whether the former is valid.
+    def screened(self, nominal: FloatArray, draws: int, number: int = 0) -> tuple[FloatArray, FloatArray | None, bool]:
+        """The best of the nominal model (N,) and draws from the prior, best first, and the first one's residual.
+
+        And whether the nominal model is valid.
 
         The nominal model is among them, last at least, if it is valid.
 
@@ -388,7 +347,7 @@ class SegmentSolver:
         best = [int(k) for k in order if np.isfinite(loss[k])][:_SCOUTS]
         if best and valid[0] and 0 not in best:
             best[-1] = 0
-        return thetas[best] if draws else thetas, bool(valid[0])
+        return thetas[best] if draws else thetas, residual[best[0]] if best else None, bool(valid[0])
 
     def _profile(self, view: Windows, residual: FloatArray) -> float:
         """Energy of a residual (K, L, C) with white noise of its own size."""
@@ -466,23 +425,23 @@ class SegmentSolver:
         hessian = precision + self.prior.precision + FLAT_PRECISION * np.eye(n)
         energy = self._profile(view, lin.residual) + self.prior.energy(here.theta)
         thetas = np.stack([self._moved(hessian, pull, here.theta, d) for d in self._dampings(here)])
-        residuals, valid = view.residuals(thetas, view.no_starts(len(thetas)))
-        energies = np.array(
-            [
-                self._profile(view, r) + self.prior.energy(theta) if ok else np.inf
-                for theta, r, ok in zip(thetas, residuals, valid, strict=True)
-            ]
-        )
-        best, after = int(energies.argmin()), replace(here, iteration=here.iteration + 1)
-        gained, damping = energy - float(energies[best]), float(here.damping * _DAMPINGS[best])
-        scale = self._scaled(view, precision, None)
+        linear = lin.residual - lin.jacobian @ (thetas[0] - here.theta)
+        expected = energy - self._profile(view, linear) - self.prior.energy(thetas[0])
+
+        def energy_of(theta: FloatArray, _: FloatArray, residual: FloatArray) -> float:
+            return self._profile(view, residual) + self.prior.energy(theta)
+
+        best, residual, lowest = best_step(view, thetas, view.no_starts(len(thetas)), energy_of, energy, expected)
+        gained, damping = energy - lowest, float(here.damping * _DAMPINGS[best])
+        scale, after = self._scaled(view, precision, None), replace(here, iteration=here.iteration + 1)
         after = replace(after, scale=scale, axes=self._axes(view, here.theta, hessian, scale), noise=noise)
         after = replace(after, misfit=here.misfit or misfit(view, lin.residual))
         if gained > 0:
-            after = replace(after, theta=thetas[best], residual=residuals[best], damping=self._damped(damping))
+            after = replace(after, theta=thetas[best], residual=residual, damping=self._damped(damping))
         else:
             after = replace(after, residual=lin.residual, damping=self._damped(damping * _DAMPINGS[-1]))
-        return _PlainStep(after, lin, hessian, energy - max(gained, 0.0), gained, gained <= 0 and here.damping >= 1.0)
+        stuck = gained <= 0 and here.damping >= 1.0
+        return _PlainStep(after, lin, hessian, min(energy, lowest), gained, abs(expected - gained), stuck)
 
     def _scouted(self, state: SolverState, here: Here, energy: float) -> tuple[SolverState, Here]:
         """After a plain fit of the smallest part: from the next starting point, or on from the best end of all."""
@@ -656,17 +615,9 @@ class SegmentSolver:
             thetas.append(theta)
             changes.append(solved.blocks(move))
         stacked, all_starts = np.stack(thetas), starts + np.stack(changes)
-        residuals, valid = view.residuals(stacked, all_starts)
-        energies = np.array(
-            [
-                energy(t, s, r) if ok else np.inf
-                for t, s, r, ok in zip(stacked, all_starts, residuals, valid, strict=True)
-            ]
-        )
-        best = int(energies.argmin())
+        best, residual, lowest = best_step(view, stacked, all_starts, energy, now, expected)
         damping = float(here.damping * _DAMPINGS[best])
-        gained = now - float(energies[best])
-        return _Trial(stacked[best], all_starts[best], residuals[best], gained, expected, damping), scale
+        return _Trial(stacked[best], all_starts[best], residual, now - lowest, expected, damping), scale
 
     def _leaves_no_room(self) -> bool:
         """Whether the budget leaves no room for another step."""
@@ -942,6 +893,29 @@ def is_back(theta: FloatArray, begin: FloatArray, optimum: WindowOptimum) -> boo
     eigenvalues, axes = np.linalg.eigh(optimum.covariance)
     left, whole = (np.abs((point - optimum.mean) @ axes) / np.sqrt(eigenvalues) for point in (theta, begin))
     return bool((left < np.maximum(1.0, 0.1 * whole)).all())
+
+
+def best_step(
+    view: Windows,
+    thetas: FloatArray,
+    starts: FloatArray,
+    energy: Callable[[FloatArray, FloatArray, FloatArray], float],
+    now: float,
+    expected: float,
+) -> tuple[int, FloatArray, float]:
+    """Of steps to thetas (M, N) and starts (M, W, D) that which leads lowest: its number, residual and energy.
+
+    The others are simulated only where the first gains much less than ``expected`` on the energy ``now``.
+    """
+    best, residual, lowest = 0, np.zeros(0), np.inf
+    for some in (range(1), range(1, len(thetas))):
+        residuals, valid = view.residuals(thetas[some], starts[some])
+        for k, r, ok in zip(some, residuals, valid, strict=True):
+            if (value := energy(thetas[k], starts[k], r) if ok else np.inf) < lowest or k == 0:
+                best, residual, lowest = k, r, value
+        if now - lowest > 0.75 * expected:
+            break
+    return best, residual, float(lowest)
 
 
 def _log_errors(view: Windows, residual: FloatArray) -> FloatArray:
