@@ -73,10 +73,6 @@ ADVICE: dict[Code, str] = {
         "Several places explain the logs about equally well. Look at them in the report; another motion in the log "
         "tells them apart."
     ),
-    Code.PROCESS_NOISE_UNSETTLED: (
-        "How much is process noise and how much measurement noise was still moving. Give `search.restarts`, or "
-        "`measurements.noise_sd` where it is known."
-    ),
     Code.NOT_THE_NORMAL: (
         "The posterior bends more than a normal follows, or the search stands at a local optimum between contacts. "
         f"Give `search.restarts` and a larger `budget`, cut the logs shorter, or measure velocities. {_COMPARE}"
@@ -121,10 +117,6 @@ ADVICE: dict[Code, str] = {
     ),
     Code.HELD_OUT_AT_REST: "Only the errors on held-out logs suffer. Measure the pose there too.",
     Code.IMPACTS: "With `state_space` every sample is a segment of its own, and process noise is estimated.",
-    Code.BEYOND_START_NOISE: (
-        "Raise `budget`, with another `--out`: the search then begins from more places. Shorter windows have fewer "
-        "valleys. If nothing helps, the model lacks something: `sipe discover`."
-    ),
     Code.NONLINEAR_STARTS: "Starts are marginalised by a linearisation, which fails over long windows. Halve `window`.",
     Code.NONLINEAR_STATES: "As of starts: states between contacts are linearised. Hold it against `laplace`.",
     Code.NO_EFFECT: (
@@ -191,9 +183,10 @@ ADVICE: dict[Code, str] = {
     Code.COLUMN_NOT_FOLLOWED: "Look whether the fit follows it; else at its zero, unit and sign.",
     Code.CHECKS_THINNED: "Nothing to do; `sipe discover` looks at all of them.",
     Code.RESIDUALS_LEFT_OUT: "Look at the size of the process noise in place of the residuals.",
-    Code.PROCESS_NOISE: "What the model lacks acts there. A few per cent are usual of a good model.",
-    Code.PROCESS_OUTLIERS: "Look at the log at these times: a kick, a contact, a sample that was lost.",
-    Code.PROCESS_NOISE_SMALL: "Nothing to do.",
+    Code.PROCESS_NOISE: (
+        "What the model lacks acts there. A few per cent are usual of a good model. Where steps stand out, look at the "
+        "log at these times: a kick, a contact, a sample that was lost."
+    ),
     Code.PROCESS_NOISE_LARGE: "Add what you suspect as parameters, or measure with less noise.",
     Code.WITHIN_PRIOR: "Nothing to do.",
     Code.OUTSIDE_PRIOR: (

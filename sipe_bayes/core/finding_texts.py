@@ -141,7 +141,6 @@ class Code(Enum):
     # laplace
     DIVERGES_AS_GIVEN = caution("the model as given diverges on these logs; the search started elsewhere")
     SEPARATE_OPTIMA = caution("the search found {count} separate optima; the posterior is a mixture of them")
-    PROCESS_NOISE_UNSETTLED = blocking("the process noise has not converged: do not rely on the intervals")
     NOT_THE_NORMAL = blocking(
         "The posterior is not the normal that the intervals are taken from: {effective:.1f} of {draws} draws are "
         "effective. Do not rely on the intervals. Compare with mcmc; or give restarts, shorter logs or more channels"
@@ -151,9 +150,8 @@ class Code(Enum):
         "that it may be as right: do not rely on the intervals"
     )
     NOISE_EXCEEDS_SCATTER = blocking(
-        "what is taken for noise of {channel} is {ratio:.1f} times as large as its scatter from sample to sample: the "
-        "fit does not follow it, as in a wrong valley between contacts or where the model lacks something: do not rely "
-        "on the intervals"
+        "The residuals of {channel} are {ratio:.1f} times the measurement noise. Do not rely on the intervals: the "
+        "search ended at a wrong optimum, or the model lacks something"
     )
     NOT_JUDGED = blocking(
         "the budget left no room to see whether the posterior is the normal that the intervals are taken from: raise it"
@@ -162,7 +160,9 @@ class Code(Enum):
         "the budget ended before the search had settled: the estimate is the best so far, and its intervals are "
         "guessed from the way it has come; give a larger budget, and the same folder goes on"
     )
-    SEARCH_UNSETTLED = blocking("the search had not settled after {steps} steps: look at the residuals first")
+    SEARCH_UNSETTLED = blocking(
+        "The search had not settled after {steps} steps. Do not rely on the intervals; look at the residuals first"
+    )
     WILD_SAMPLES = caution(
         "{count} samples of {channels} in {logs} logs were left out of the fit: no smooth motion explains them "
         "(glitches, or what the model lacks)"
@@ -182,10 +182,6 @@ class Code(Enum):
     IMPACTS = blocking(
         "Bodies strike or slip within the segments of these logs, so the likelihood of segments has many optima. "
         "Use likelihood = 'state_space', in Python sipe.StateSpace()"
-    )
-    BEYOND_START_NOISE = blocking(
-        "The residuals are {times:.1f} times the known measurement noise: the search ended at a wrong optimum, or the "
-        "model lacks something. Raise the budget and the restarts"
     )
 
     # mcmc
@@ -262,12 +258,8 @@ class Code(Enum):
     )
     PROCESS_NOISE = note(
         "Process noise is largest in the {coordinate}: its sd is {sd:.2g}, {percent} % of how far that moves in a "
-        "control step."
+        "control step. {count} of {steps} control steps stand out and count for little{times}."
     )
-    PROCESS_OUTLIERS = note(
-        "{count} of {steps} control steps stand out and count for little, as where a contact is missed: at {times}."
-    )
-    PROCESS_NOISE_SMALL = note("The model follows the logs closely{elsewhere}.")
     PROCESS_NOISE_LARGE = caution(
         "A model that lacks nothing needs next to no process noise. Either this one lacks something there, or "
         "measurement noise hides how stiff the contact is: then estimates may be off by several posterior sds"

@@ -44,7 +44,6 @@ _UNFINISHED = (
     Code.TIME_LIMIT,
     Code.SEARCH_CUT_SHORT,
     Code.SEARCH_UNSETTLED,
-    Code.PROCESS_NOISE_UNSETTLED,
     Code.NOT_JUDGED,
 )
 """Those that say no more than that a search did not come to its end: what the model lacks is often the cause."""

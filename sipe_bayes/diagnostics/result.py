@@ -35,7 +35,7 @@ FLAGS: Mapping[Code, str] = {
 }
 """Findings about single parameters, and the flag that result.json has for them."""
 NUISANCE = "nuisance"
-PROCESS_NOISE = (Code.PROCESS_NOISE, Code.PROCESS_OUTLIERS, Code.PROCESS_NOISE_SMALL, Code.PROCESS_NOISE_LARGE)
+PROCESS_NOISE = (Code.PROCESS_NOISE, Code.PROCESS_NOISE_LARGE)
 
 
 @dataclass(frozen=True)

@@ -245,6 +245,9 @@ class Estimator(ABC, Generic[S]):
         except BudgetExhausted:
             stored.write()
             self.find(Code.BUDGET_SPENT, budget=self.budget)
+        except BaseException:  # whatever interrupts it
+            stored.write()
+            raise
         return self._finished(last.state, batch)
 
     def tell(self, what: str, rollouts: int) -> None:

@@ -191,8 +191,8 @@ class MCMC(Estimator[MCMCState]):
         # what was noticed on the way holds; what its posterior says of itself does not hold of the chains
         self.findings.extend(search.snapshot.findings)
         assert search.best is not None
-        if Code.PROCESS_NOISE_UNSETTLED in {one.code for one in search.findings}:
-            self.find(Code.PROCESS_NOISE_UNSETTLED)  # the chains hold that noise
+        for one in search.findings.of(Code.SEARCH_UNSETTLED):
+            self.findings.add(one)  # the chains hold that noise
         fit = target_fit(windows, search.best)
         if search.snapshot.state.draws is not None:  # kernels, which are slow to draw from
             mean, covariance = normals.gaussian_moments()

@@ -17,14 +17,14 @@ def test_what_a_run_found(tmp_path: Path) -> None:
     """With the run's own numbers, the worst first, each code once."""
     found = [
         finding(Code.CHECKS_THINNED, windows=84, asked=67),
-        finding(Code.BEYOND_START_NOISE, times=12.34),
-        finding(Code.BEYOND_START_NOISE, times=5.0),
+        finding(Code.NOISE_EXCEEDS_SCATTER, channel="q", ratio=12.34),
+        finding(Code.NOISE_EXCEEDS_SCATTER, channel="q", ratio=5.0),
     ]
     (tmp_path / "result.json").write_text(json.dumps({"findings": [one.to_dict() for one in found]}))
     lines = CliRunner().invoke(app, ["explain", str(tmp_path)]).output.splitlines()
-    assert lines[0] == "beyond_start_noise (blocking, 2 times, of which the first)"
+    assert lines[0] == "noise_exceeds_scatter (blocking, 2 times, of which the first)"
     assert "12.3 times" in lines[1]
-    assert lines[2].strip() == ADVICE[Code.BEYOND_START_NOISE]
+    assert lines[2].strip() == ADVICE[Code.NOISE_EXCEEDS_SCATTER]
     assert lines[3].startswith("checks_thinned (note)")
 
 

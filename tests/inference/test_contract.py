@@ -191,7 +191,7 @@ def test_an_interrupted_fit_resumes_to_the_same_posterior(name: str, tmp_path: P
 def test_a_doubt_survives_an_interruption(tmp_path: Path) -> None:
     class Doubting(type(get_estimator(pendulum(), "cem"))):  # type: ignore[misc]
         def step(self, state: Any, trajectories: Any) -> Any:
-            self.find(Code.PROCESS_NOISE_UNSETTLED)
+            self.find(Code.SEARCH_UNSETTLED, steps=2)
             return super().step(state, trajectories)
 
     def fitted() -> Any:
@@ -201,7 +201,7 @@ def test_a_doubt_survives_an_interruption(tmp_path: Path) -> None:
 
     first, again = fitted(), fitted()  # the second one only reads
     assert again.findings.blocking == first.findings.blocking
-    assert [item.code for item in first.findings.blocking] == [Code.PROCESS_NOISE_UNSETTLED]
+    assert [item.code for item in first.findings.blocking] == [Code.SEARCH_UNSETTLED]
     first.checkpoint = None
     first.step = super(Doubting, first).step
     first.fit(log(pendulum(), TRUTH, 1, steps=100))

@@ -293,7 +293,7 @@ class Laplace(Estimator[LaplaceState]):
         if isinstance(best, ChainOptimum):
             self.diagnostics["pareto_k"] = [one.pareto_k for one in state.judgements]
             if not best.settled:
-                self.find(Code.PROCESS_NOISE_UNSETTLED)
+                self.find(Code.SEARCH_UNSETTLED, steps=search.here.iteration)
             if best.excess > THRESHOLDS.noise_excess:
                 self.find(Code.NOISE_EXCEEDS_SCATTER, channel=best.noisiest, ratio=best.excess)
             distance = contradiction([one for one in search.optima if isinstance(one, ChainOptimum)])

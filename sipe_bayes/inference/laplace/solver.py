@@ -650,7 +650,7 @@ class SegmentSolver:
             cut_short = not whole and (early or self._leaves_no_room())
             reason = finding(Code.SEARCH_CUT_SHORT) if cut_short else finding(Code.SEARCH_UNSETTLED, steps=steps)
         elif (times := beyond_known_noise(view, optimum.sd, lin.residual)) is not None:
-            reason = finding(Code.BEYOND_START_NOISE, times=times)
+            reason = finding(Code.NOISE_EXCEEDS_SCATTER, channel="the logs", ratio=times)
         return replace(optimum, starts=here.starts, slope=slope, finding=reason, early=early)
 
     def _ended(

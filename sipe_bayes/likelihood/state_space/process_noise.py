@@ -18,20 +18,22 @@ def process_noise_findings(
     """Hold the process noise (D,) against how far each coordinate moves in a control step (D,).
 
     Says where process noise is largest, which steps stand out (``outliers``: after which of the chain's states), and
-    whether the model follows the logs.
+    whether it is more than a model that lacks nothing needs.
     """
     share = np.where(chain.irrelevant, 0.0, process / movement)
     worst = int(share.argmax())
     percent = f"{100 * share[worst]:.0f}" if share[worst] > 0.1 else f"{100 * share[worst]:.2g}"
-    findings = [finding(Code.PROCESS_NOISE, coordinate=chain.labels[worst], sd=float(process[worst]), percent=percent)]
-    if len(outliers):
-        count, steps = len(outliers), int(chain.linked.sum())
-        findings.append(finding(Code.PROCESS_OUTLIERS, count=count, steps=steps, times=_times(chain, outliers)))
-    if share[worst] < THRESHOLDS.much_process_noise:
-        findings.append(finding(Code.PROCESS_NOISE_SMALL, elsewhere=" elsewhere" if len(outliers) else ""))
-    else:
-        findings.append(finding(Code.PROCESS_NOISE_LARGE))
-    return findings
+    largest = finding(
+        Code.PROCESS_NOISE,
+        coordinate=chain.labels[worst],
+        sd=float(process[worst]),
+        percent=percent,
+        count=len(outliers),
+        steps=int(chain.linked.sum()),
+        times=f": at {_times(chain, outliers)}" if len(outliers) else "",
+    )
+    much = share[worst] >= THRESHOLDS.much_process_noise
+    return [largest, finding(Code.PROCESS_NOISE_LARGE)] if much else [largest]
 
 
 def _times(chain: Chain, outliers: Sequence[int] | IntArray) -> str:

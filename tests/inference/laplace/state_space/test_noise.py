@@ -121,7 +121,7 @@ def test_process_noise_says_where_the_model_lacks_something() -> None:
         noise = (np.array(estimator.diagnostics[k]) for k in ("process_noise", "movement"))
         findings[name] = process_noise_findings(chain, *noise)
     print(findings)
-    assert [item.code for item in findings["right"]] == [Code.PROCESS_NOISE, Code.PROCESS_NOISE_SMALL]
+    assert [item.code for item in findings["right"]] == [Code.PROCESS_NOISE]
     assert [item.code for item in findings["wrong"]] == [Code.PROCESS_NOISE, Code.PROCESS_NOISE_LARGE]
     assert "of hinge" in findings["wrong"][0].text
 
