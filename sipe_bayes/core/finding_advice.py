@@ -101,8 +101,8 @@ ADVICE: dict[Code, str] = {
     ),
     Code.SEARCH_CUT_SHORT: "Raise `budget`. The message's estimate is a stage on the way.",
     Code.SEARCH_UNSETTLED: (
-        "Often a ridge of parameters that act alike, or a rough simulation: fix one of the parameters of a ridge. "
-        f"{_COMPARE}"
+        "Often a ridge of parameters that act alike, or a rough simulation: fix one of the parameters of a ridge. With "
+        f"`state_space` give `measurements.noise_sd` where it is known. {_COMPARE}"
     ),
     Code.WILD_SAMPLES: (
         "Nothing to do for a few. For many see whether the column itself jumps: then look at the sensor, its cable and "
@@ -117,6 +117,10 @@ ADVICE: dict[Code, str] = {
     ),
     Code.HELD_OUT_AT_REST: "Only the errors on held-out logs suffer. Measure the pose there too.",
     Code.IMPACTS: "With `state_space` every sample is a segment of its own, and process noise is estimated.",
+    Code.BEYOND_START_NOISE: (
+        "Raise `budget`, with another `--out`: the search then begins from more places. Shorter segments have fewer "
+        "local optima. If nothing helps, the model lacks something: `sipe discover`."
+    ),
     Code.NONLINEAR_STARTS: "Starts are marginalised by a linearisation, which fails over long windows. Halve `window`.",
     Code.NONLINEAR_STATES: "As of starts: states between contacts are linearised. Hold it against `laplace`.",
     Code.NO_EFFECT: (

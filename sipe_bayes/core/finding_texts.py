@@ -150,8 +150,8 @@ class Code(Enum):
         "that it may be as right: do not rely on the intervals"
     )
     NOISE_EXCEEDS_SCATTER = blocking(
-        "The residuals of {channel} are {ratio:.1f} times the measurement noise. Do not rely on the intervals: the "
-        "search ended at a wrong optimum, or the model lacks something"
+        "The residuals of {channel} are {ratio:.1f} times as large as its samples scatter. Do not rely on the "
+        "intervals: the search ended at a wrong optimum, or the model lacks something"
     )
     NOT_JUDGED = blocking(
         "the budget left no room to see whether the posterior is the normal that the intervals are taken from: raise it"
@@ -161,7 +161,7 @@ class Code(Enum):
         "guessed from the way it has come; give a larger budget, and the same folder goes on"
     )
     SEARCH_UNSETTLED = blocking(
-        "The search had not settled after {steps} steps. Do not rely on the intervals; look at the residuals first"
+        "The search had not converged after {steps} steps. Do not rely on the intervals; look at the residuals first"
     )
     WILD_SAMPLES = caution(
         "{count} samples of {channels} in {logs} logs were left out of the fit: no smooth motion explains them "
@@ -182,6 +182,11 @@ class Code(Enum):
     IMPACTS = blocking(
         "Bodies strike or slip within the segments of these logs, so the likelihood of segments has many optima. "
         "Use likelihood = 'state_space', in Python sipe.StateSpace()"
+    )
+
+    BEYOND_START_NOISE = blocking(
+        "The residuals are {times:.1f} times the known measurement noise: the search ended at a wrong optimum, or the "
+        "model lacks something. Raise the budget and the restarts"
     )
 
     # mcmc
@@ -258,7 +263,7 @@ class Code(Enum):
     )
     PROCESS_NOISE = note(
         "Process noise is largest in the {coordinate}: its sd is {sd:.2g}, {percent} % of how far that moves in a "
-        "control step. {count} of {steps} control steps stand out and count for little{times}."
+        "control step. Steps that stand out and count for little: {count} of {steps}{times}."
     )
     PROCESS_NOISE_LARGE = caution(
         "A model that lacks nothing needs next to no process noise. Either this one lacks something there, or "

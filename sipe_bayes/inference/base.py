@@ -229,7 +229,7 @@ class Estimator(ABC, Generic[S]):
         self._last, self._run = None, fingerprint
         if last is not None:
             self.go_on_from(last)
-        last = last or self._started(batch)
+        first = last = last or self._started(batch)
         stored = Stored(self.checkpoint, fingerprint, last, self.checkpoint_seconds)
         try:
             while not last.state.done:
@@ -245,8 +245,10 @@ class Estimator(ABC, Generic[S]):
         except BudgetExhausted:
             stored.write()
             self.find(Code.BUDGET_SPENT, budget=self.budget)
-        except BaseException:  # whatever interrupts it
-            stored.write()
+        except BaseException:  # whatever interrupts it; an earlier checkpoint outlives a failure in the first step
+            if self.checkpoint is not None and (last is not first or not self.checkpoint.exists()):
+                with suppress(OSError):
+                    stored.write()
             raise
         return self._finished(last.state, batch)
 

@@ -37,7 +37,7 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace import Laplace, Target, TargetFit, noise_diagnostics, target_fit, target_of
-from sipe_bayes.likelihood import BoundLikelihood, BoundStates, BudgetExhausted, BudgetTooSmall, Segments
+from sipe_bayes.likelihood import BoundLikelihood, BoundStates, BudgetExhausted, BudgetTooSmall, Segments, StateSpace
 from sipe_bayes.posterior import GaussianMixture, Particles
 from sipe_bayes.posterior.ensemble import mixing_of
 
@@ -191,7 +191,7 @@ class MCMC(Estimator[MCMCState]):
         # what was noticed on the way holds; what its posterior says of itself does not hold of the chains
         self.findings.extend(search.snapshot.findings)
         assert search.best is not None
-        for one in search.findings.of(Code.SEARCH_UNSETTLED):
+        for one in search.findings.of(Code.SEARCH_UNSETTLED) if isinstance(self.likelihood, StateSpace) else ():
             self.findings.add(one)  # the chains hold that noise
         fit = target_fit(windows, search.best)
         if search.snapshot.state.draws is not None:  # kernels, which are slow to draw from

@@ -208,7 +208,7 @@ def estimate_noise(
     best = minimize(
         scaled, x0 / unit, jac=True, method="SLSQP", bounds=(bounds / unit).T, options={"ftol": 1e-4, "maxiter": 100}
     )
-    return unpack(best.x * unit)
+    return unpack(best.x * unit if best.fun <= loss(x0)[0] else x0)  # it accepts a step that does not gain
 
 
 def noise_cloud(

@@ -94,7 +94,8 @@ def probes_cost(windows: BoundLikelihood, placed: Sequence[Placed]) -> int:
     """Rollouts that ``probes`` takes, but for extensions that do not go together; at this theta at most."""
     groups = _groups(placed)
     each = (1 + sum(one.probes.shape[0] * one.probes.shape[1] for one in group) for group in groups)
-    return (sum(each) + RUNS) * len(windows.trajectories) if placed else 0
+    runs = RUNS * isinstance(windows.simulator.environment, MjcfEnvironment)
+    return (sum(each) + runs) * len(windows.trajectories)
 
 
 def probes(

@@ -99,7 +99,7 @@ class Predictions:
 
 
 def every_channel(problem: Problem, logs: Trajectories) -> BoundLikelihood:
-    """BoundLikelihood of logs by which they are scored and drawn, in all channels."""
+    """The logs bound, in all channels, as they are scored and drawn."""
     return BoundLikelihood(replace(problem.segments, fit=None), problem.simulator, logs)
 
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.inference import importance
 from sipe_bayes.inference.importance import Draws
 from sipe_bayes.inference.laplace.optimum import WindowOptimum
@@ -33,13 +32,13 @@ class Look:
 
     Args:
         draws: those that take the normals' place; None where these stand or nothing was asked.
+        given: batches of them whose proposals the draws did not make.
         judged: whether the budget sufficed for what was asked.
-        better: (N,), a draw that is so much better than all optima that these are none; None without one.
     """
 
     draws: Draws | None = None
+    given: int = 0
     judged: bool = True
-    better: FloatArray | None = None
 
 
 def sharing(kept: Sequence[Optimum], problem: SearchProblem) -> list[Optimum]:
@@ -49,7 +48,7 @@ def sharing(kept: Sequence[Optimum], problem: SearchProblem) -> list[Optimum]:
 
 
 def look_beyond(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) -> Look:
-    """Ask whether the optima's normals are the posterior, and draw where they are not.
+    """Ask whether the optima's normals are the posterior, and draw first batches where they are not.
 
     kept: the distinct ones, best first.
     """
@@ -81,32 +80,26 @@ def look_beyond(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum
             return Look(judged=False)
         first = [(best.mean, tuning.first_wider**2 * best.covariance), *proposals(beyond, best.covariance)]
         stands = stands and not beyond
-    return Look() if stands else _draw(problem, windows, target, shared, first)
+    draws = Draws.none(n)
+    for mean, covariance in () if stands else first:
+        if not windows.has_room(draw_size(problem, windows, kept)):
+            return Look(draws, draws.batches, judged=False)
+        share = tuning.share if draws.batches else tuning.first_share
+        draws = importance.drawn_from(draws, target, mean, covariance, share, problem.prior, problem.seed, tuning)
+    return Look() if stands else Look(draws, draws.batches)
 
 
-def _draw(
-    problem: SearchProblem,
-    windows: Windows,
-    target: WindowTarget,
-    shared: list[Optimum],
-    first: list[tuple[FloatArray, FloatArray]],
-) -> Look:
-    """Draws from normals (mean, covariance) ``first``, then from those of the draws, as long as these promise more."""
-    tuning, normals, n = problem.options.tuning.importance, mixture(shared, problem.space), len(problem.space)
-    draws, highest = Draws.none(n), None
-    cost = 2 if windows.num_start else 1 * (importance.batch_size(n, tuning) + len(shared))
-    while windows.has_room(cost):
-        if draws.batches < len(first):
-            mean, covariance = first[draws.batches]
-            share = tuning.share if draws.batches else tuning.first_share
-            draws = importance.drawn_from(draws, target, mean, covariance, share, problem.prior, problem.seed, tuning)
-            continue
-        draws = importance.draw(draws, target, normals, problem.prior, problem.seed, tuning)
-        problem.tell(f"{len(draws.values)} importance draws", windows.rollouts)
-        if highest is None:
-            highest = target(np.stack([one.theta for one in shared])).max()
-        if draws.values.max() > highest + tuning.elsewhere:
-            return Look(draws, better=draws.points[draws.values.argmax()])
-        if importance.ended(draws, problem.prior, tuning, len(first)):
-            break
-    return Look(draws, judged=draws.batches >= len(first))
+def draw_size(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum]) -> int:
+    """Simulations of the logs that one more batch of draws takes, with a linearisation and the optima's values."""
+    values = importance.batch_size(len(problem.space), problem.options.tuning.importance) + len(sharing(kept, problem))
+    return (2 if windows.num_start else 1) * values + windows.num_start + 1
+
+
+def draw_more(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum], draws: Draws) -> tuple[Draws, bool]:
+    """One more batch, and whether a draw is so much better than all optima that these are none."""
+    shared, tuning = sharing(kept, problem), problem.options.tuning.importance
+    assert isinstance(kept[0], WindowOptimum)
+    target = WindowTarget(problem.prior, windows, WindowFit.at(windows, kept[0]))
+    draws = importance.draw(draws, target, mixture(shared, problem.space), problem.prior, problem.seed, tuning)
+    highest = target(np.stack([one.theta for one in shared])).max()
+    return draws, bool(draws.values.max() > highest + tuning.elsewhere)

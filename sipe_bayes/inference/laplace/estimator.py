@@ -17,7 +17,7 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference import importance
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.importance import Draws, Judgement
-from sipe_bayes.inference.laplace.draws import look_beyond, sharing
+from sipe_bayes.inference.laplace.draws import draw_more, draw_size, look_beyond, sharing
 from sipe_bayes.inference.laplace.longer_windows import led_on
 from sipe_bayes.inference.laplace.optimum import WindowOptimum, WindowState, not_followed
 from sipe_bayes.inference.laplace.options import LaplaceOptions
@@ -48,6 +48,7 @@ class LaplaceState:
     Args:
         search: the state of its ``Strategy``.
         draws: those that take the normal's place; None before them, and where it stands.
+        given: batches of them whose proposals the draws did not make.
         judgements: of the normals of a chain's optima, best first.
         looked: whether what lies beyond the normal of a chain's optimum has been looked at.
         unjudged: whether the budget left no room to see whether the posterior is a normal.
@@ -56,6 +57,7 @@ class LaplaceState:
 
     search: SolverState | WindowState | StateSpaceState | KnownStartState
     draws: Draws | None = None
+    given: int = 0
     judgements: tuple[Judgement, ...] = ()
     looked: bool = False
     unjudged: bool = False
@@ -119,12 +121,18 @@ class Laplace(Estimator[LaplaceState]):
         return LaplaceState(self._strategy(self.bound(trajectories)).start())
 
     def describe(self, state: LaplaceState) -> str:
-        """Starting point and step."""
+        """Starting point and step, or draws."""
+        if state.draws is not None:
+            return f"laplace: {len(state.draws.values)} importance draws"
         return f"laplace: {state.search.describe()}"
 
     def step(self, state: LaplaceState, trajectories: Trajectories) -> LaplaceState:
-        """A step of the search; where it ends, what tells whether its normals are the posterior."""
+        """A step of the search, or, where it has ended, one more batch of draws."""
         windows = self.bound(trajectories)
+        if state.draws is not None and isinstance(windows, Windows):
+            assert isinstance(state.search, WindowState)
+            windows.mask(state.search.wild)
+            return self._drawn(windows, state, state.draws)
         strategy = self._strategy(windows)
         windows.budget = self.budget - self._judges_share(windows, state)
         try:
@@ -178,7 +186,7 @@ class Laplace(Estimator[LaplaceState]):
         return KnownStartSearch(self.problem, windows) if known else StateSpaceSearch(self.problem, windows)
 
     def _probed(self, windows: Windows | Chain, state: LaplaceState) -> LaplaceState:
-        """The state of a finished search; not done where the search goes on."""
+        """The state of a finished search; not done where the posterior is no normal and draws are to take its place."""
         ended = replace(state, done=True)
         if isinstance(windows, Chain):
             optima, may_lead = distinct(state.search.optima), self._may_lead(windows, state.search)
@@ -198,10 +206,9 @@ class Laplace(Estimator[LaplaceState]):
         if isinstance(search, SolverState) and search.here.exact and np.diag(kept[0].covariance).max() < 0.02**2:
             return replace(ended, search=search)  # narrow, and as the linearisation foretold at its own width
         look = look_beyond(self.problem, windows, kept)
-        onward = None if look.better is None else SegmentSolver(self.problem, windows).onward(search, look.better)
-        if onward is not None:
-            return replace(state, search=onward)
-        return replace(ended, search=search, draws=look.draws, unjudged=not look.judged)
+        ended = replace(ended, search=search, draws=look.draws, given=look.given, unjudged=not look.judged)
+        more = look.draws is not None and windows.has_room(draw_size(self.problem, windows, kept))
+        return replace(ended, done=not more)
 
     def _may_lead(self, chain: Chain, search: WindowState | StateSpaceState | KnownStartState) -> bool:
         """Whether a finished search may go on from where segments lead: once, where not every state is measured.
@@ -258,6 +265,18 @@ class Laplace(Estimator[LaplaceState]):
             return ended
         look = looked_beyond(self.problem, target, state.judgements[0].normal)
         return replace(ended, draws=look.draws, unjudged=not look.judged)
+
+    def _drawn(self, windows: Windows, state: LaplaceState, draws: Draws) -> LaplaceState:
+        """One more batch of draws, as long as they promise something and the budget lasts; or on from the best."""
+        assert isinstance(state.search, WindowState)
+        kept = distinct(state.search.optima)
+        draws, elsewhere = draw_more(self.problem, windows, kept, draws)
+        if elsewhere:
+            search = SegmentSolver(self.problem, windows).onward(state.search, draws.points[draws.values.argmax()])
+            if search is not None:
+                return replace(state, search=search, draws=None)
+        done = importance.ended(draws, self.prior, self.options.tuning.importance, state.given)
+        return replace(state, draws=draws, done=done or not windows.has_room(draw_size(self.problem, windows, kept)))
 
     def posterior(self, state: LaplaceState, trajectories: Trajectories) -> GaussianMixture:
         """The optima's normals, or kernels on the draws that take their place.

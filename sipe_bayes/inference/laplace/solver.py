@@ -5,8 +5,7 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
 
 .. math:: E = \tfrac12 r^\top V^{-1} r + \tfrac12 \sum_w x_w^\top P_x x_w + \tfrac12 (\theta-\mu)^\top P (\theta-\mu)
 
-**Phases**, one step of each is a linearisation and a damped step (Levenberg, Marquardt), the best of several where the
-first gains less than three quarters of what the linearisation predicts:
+**Phases**, one step of each is a linearisation and the best of a few damped steps (Levenberg, Marquardt):
 
 1. PLAIN: theta alone, the segments begin as measured, white noise of the residuals' present size. On a part of the
    segments first, then on as many as ``linearised_steps`` allows. Its end is the plain fit, the first answer.
@@ -141,7 +140,7 @@ class SolverState(WindowState):
 
 
 class _Trial(NamedTuple):
-    """The best of a batch of damped steps, to theta (N,) and starts (K, D), and the residual (K, L, C) there.
+    """The best of a few damped steps, to theta (N,) and starts (K, D), and the residual (K, L, C) there.
 
     gained: nats, not above zero where no step lowered the energy; expected: of the least damped step, by the
     linearisation; damping: of the best.
@@ -158,8 +157,8 @@ class _Trial(NamedTuple):
 class _PlainStep(NamedTuple):
     """A step of plain least squares: where the fit stands after it, and linearisation and Hessian (N, N) before it.
 
-    energy: after it, nats; gained: not above zero where no step lowered the energy; off: by how much that differs from
-    what the linearisation predicted of the least damped step; stuck: whether none is worth trying any more.
+    energy: after it, nats; gained: not above zero where no step lowered the energy; stuck: whether none is worth trying
+    any more.
     """
 
     after: Here
@@ -167,12 +166,11 @@ class _PlainStep(NamedTuple):
     hessian: FloatArray
     energy: float
     gained: float
-    off: float
     stuck: bool
 
     def ends(self, enough: float) -> bool:
-        """Whether it, or what the linearisation has left to gain after it, is no more than ``enough`` nats."""
-        return self.stuck or (self.gained > 0 and min(self.gained, self.off) <= enough)
+        """Whether a fit stands still that gains ``enough`` nats or fewer."""
+        return self.stuck or 0 < self.gained <= enough
 
 
 class _End(NamedTuple):
@@ -225,7 +223,7 @@ class SegmentSolver:
         return replace(state, points=points, point=len(state.points), here=here, elsewhere=False, ends=(), done=False)
 
     def step(self, state: WindowState) -> SolverState:
-        """One linearisation and the best of a batch of steps; or the comparison at the end."""
+        """One linearisation and the best of a few steps; or the comparison at the end."""
         assert isinstance(state, SolverState)
         self.windows.mask(state.wild)
         self._views = {}
@@ -257,7 +255,7 @@ class SegmentSolver:
             (k for k, (stage, part, _) in enumerate(course) if (stage, part) == (here.stage, max(here.part, whole))), 3
         )
         for k, (stage, part, steps) in enumerate(course[now:] if not state.done else ()):
-            columns = n + (d if stage is Stage.FIT else 0) + len(_DAMPINGS)
+            columns = n + (d if stage is Stage.FIT else 0) + 2  # trials: mostly one
             new = part == whole or self._share(part - 1) < 1 or stage is not course[max(now + k - 1, 0)][0]
             look += steps * (0.5 if k == 0 else 1.0) * columns * min(self._share(part), 1.0) * new
         return look * logs
@@ -415,7 +413,7 @@ class SegmentSolver:
         return self._plain_ended(replace(state, here=here), after, step.lin, keep, view)
 
     def _plain_step(self, view: Windows, here: Here) -> _PlainStep:
-        """One linearisation in theta alone and the best of a batch of damped steps."""
+        """One linearisation in theta alone and the best of a few damped steps."""
         n, starts, scale, axes = view.num_theta, view.no_starts(), self._lengths(view, here), self._usable(here)
         lin = view.linearise(here.theta, starts, True, False, here.residual, scale[:n], axes=axes)
         noise = present_noise(view, lin.residual)
@@ -425,13 +423,11 @@ class SegmentSolver:
         hessian = precision + self.prior.precision + FLAT_PRECISION * np.eye(n)
         energy = self._profile(view, lin.residual) + self.prior.energy(here.theta)
         thetas = np.stack([self._moved(hessian, pull, here.theta, d) for d in self._dampings(here)])
-        linear = lin.residual - lin.jacobian @ (thetas[0] - here.theta)
-        expected = energy - self._profile(view, linear) - self.prior.energy(thetas[0])
 
         def energy_of(theta: FloatArray, _: FloatArray, residual: FloatArray) -> float:
             return self._profile(view, residual) + self.prior.energy(theta)
 
-        best, residual, lowest = best_step(view, thetas, view.no_starts(len(thetas)), energy_of, energy, expected)
+        best, residual, lowest = best_step(view, thetas, view.no_starts(len(thetas)), energy_of)
         gained, damping = energy - lowest, float(here.damping * _DAMPINGS[best])
         scale, after = self._scaled(view, precision, None), replace(here, iteration=here.iteration + 1)
         after = replace(after, scale=scale, axes=self._axes(view, here.theta, hessian, scale), noise=noise)
@@ -441,7 +437,7 @@ class SegmentSolver:
         else:
             after = replace(after, residual=lin.residual, damping=self._damped(damping * _DAMPINGS[-1]))
         stuck = gained <= 0 and here.damping >= 1.0
-        return _PlainStep(after, lin, hessian, min(energy, lowest), gained, abs(expected - gained), stuck)
+        return _PlainStep(after, lin, hessian, min(energy, lowest), gained, stuck)
 
     def _scouted(self, state: SolverState, here: Here, energy: float) -> tuple[SolverState, Here]:
         """After a plain fit of the smallest part: from the next starting point, or on from the best end of all."""
@@ -592,7 +588,7 @@ class SegmentSolver:
         starts: FloatArray,
         tolerance: float,
     ) -> tuple[_Trial, tuple[FloatArray, FloatArray] | None]:
-        """The best of a batch of damped steps of theta and the initial states, and lengths of the next differences."""
+        """The best of a few damped steps of theta and the initial states, and lengths of the next differences."""
         energy, n = WindowEnergy(view, noise, self.prior), view.num_theta
         normal = moments.normal(noise)
         now = energy(here.theta, starts, lin.residual)
@@ -615,7 +611,7 @@ class SegmentSolver:
             thetas.append(theta)
             changes.append(solved.blocks(move))
         stacked, all_starts = np.stack(thetas), starts + np.stack(changes)
-        best, residual, lowest = best_step(view, stacked, all_starts, energy, now, expected)
+        best, residual, lowest = best_step(view, stacked, all_starts, energy)
         damping = float(here.damping * _DAMPINGS[best])
         return _Trial(stacked[best], all_starts[best], residual, now - lowest, expected, damping), scale
 
@@ -650,7 +646,7 @@ class SegmentSolver:
             cut_short = not whole and (early or self._leaves_no_room())
             reason = finding(Code.SEARCH_CUT_SHORT) if cut_short else finding(Code.SEARCH_UNSETTLED, steps=steps)
         elif (times := beyond_known_noise(view, optimum.sd, lin.residual)) is not None:
-            reason = finding(Code.NOISE_EXCEEDS_SCATTER, channel="the logs", ratio=times)
+            reason = finding(Code.BEYOND_START_NOISE, times=times)
         return replace(optimum, starts=here.starts, slope=slope, finding=reason, early=early)
 
     def _ended(
@@ -900,22 +896,13 @@ def best_step(
     thetas: FloatArray,
     starts: FloatArray,
     energy: Callable[[FloatArray, FloatArray, FloatArray], float],
-    now: float,
-    expected: float,
 ) -> tuple[int, FloatArray, float]:
-    """Of steps to thetas (M, N) and starts (M, W, D) that which leads lowest: its number, residual and energy.
-
-    The others are simulated only where the first gains much less than ``expected`` on the energy ``now``.
-    """
-    best, residual, lowest = 0, np.zeros(0), np.inf
-    for some in (range(1), range(1, len(thetas))):
-        residuals, valid = view.residuals(thetas[some], starts[some])
-        for k, r, ok in zip(some, residuals, valid, strict=True):
-            if (value := energy(thetas[k], starts[k], r) if ok else np.inf) < lowest or k == 0:
-                best, residual, lowest = k, r, value
-        if now - lowest > 0.75 * expected:
-            break
-    return best, residual, float(lowest)
+    """Of steps to thetas (M, N) and starts (M, W, D) that which leads lowest: its number, residual and energy."""
+    residuals, valid = view.residuals(thetas, starts)
+    each = zip(thetas, starts, residuals, valid, strict=True)
+    values = np.array([energy(t, s, r) if ok else np.inf for t, s, r, ok in each])
+    best = int(values.argmin())
+    return best, residuals[best], float(values[best])
 
 
 def _log_errors(view: Windows, residual: FloatArray) -> FloatArray:

@@ -91,7 +91,7 @@ def test_a_jump_that_stands_out_is_an_outlier() -> None:
     assert float(sampled.stddev[0]) == pytest.approx(sd, rel=0.3)
     chain = bind(StateSpace(), spring(), Trajectories.stack(kicked_logs()))
     outlying = process_noise_findings(chain, PROCESS, np.ones(2), [20, 141])[0]
-    assert "2 of 233 control steps stand out" in outlying.text
+    assert "count for little: 2 of 233" in outlying.text
     assert "0.4 s of log0, 0.4 s of log1" in outlying.text
 
 
