@@ -202,7 +202,7 @@ def test_state_space_leaves_out_what_does_not_apply_and_says_so(tmp_path: Path, 
     found = strict_json(result.stdout)
     assert found["misfit"] is None
     assert "state is unknown at every sample" in found["left_out"][0]
-    assert "The model follows the logs closely." in found["left_out"][1]
+    assert "Process noise is largest in the position of hinge" in found["left_out"][1]
     assert (found["comparison"]["verdict"], len(found["outside_prior"])) == ("better", 1)
     assert found["noise"]["angle"]["tau"] == 0
     for p in found["parameters"]:  # 5 sd: one in a million
