@@ -1,9 +1,8 @@
 """Samples of a measured position that no smooth motion explains: glitches of an encoder, packets that were lost.
 
-A position goes on from sample to sample as it does around; a wild sample jumps away and comes back. One far off counts
-in a sum of squares as much as thousands of good ones, so such samples are left out of a log as it is read, and neither
-the fit nor the starts of windows nor the checks see them. A fit leaves out those that its residuals show
-(``sipe_bayes.likelihood.wild_residuals``).
+An outlier jumps away from the samples around it and comes back. In a sum of squares one outlier can weigh as much as
+thousands of good samples. So outliers are left out of a log as it is read: neither the fit nor the initial states nor
+the checks see them. A fit also leaves out those that its residuals show (``sipe_bayes.likelihood.wild_residuals``).
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ def jumps(values: FloatArray) -> IntArray:
 
 
 def wild_positions(values: FloatArray) -> BoolArray:
-    """Which samples (n,) of a measured position (n,), or of a vector or aligned quaternion (n, K), are wild.
+    """Which samples (n,) of a measured position (n,), or of a vector or aligned quaternion (n, K), are outliers.
 
     NaN where nothing was measured. Fewer than 40 samples do not tell how a position moves.
     """
@@ -49,9 +48,10 @@ def wild_positions(values: FloatArray) -> BoolArray:
 
 
 def away_from(rows: FloatArray, at: IntArray, longest: int, edges: IntArray | tuple[()] = ()) -> BoolArray:
-    """Which of rows (n, K) lie between a jump ``at`` k -> k + 1 and the one that comes home, or at an end.
+    """Which of rows (n, K) are outliers: between a jump ``at`` k -> k + 1 and the jump back, or at an end.
 
-    Home is within .4 of the jump. A jump at one of ``edges`` alone puts nothing away.
+    A jump leads back if it ends within .4 of the first jump's length from where that began. A jump at one of ``edges``
+    alone makes no outlier.
     """
     away = np.zeros(len(rows), bool)
     here = 0

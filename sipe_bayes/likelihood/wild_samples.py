@@ -1,4 +1,4 @@
-"""Samples that hide in the motion, and that the residuals of a fit show before its noise is estimated.
+"""Outliers that only the residuals of a fit show, found before its noise is estimated.
 
 They are masked as those of a log are when it is read (``sipe_bayes.core.wild_samples``): a redescending estimator of
 two weights, all or nothing (P. Huber 1981, "Robust Statistics", 4.8).

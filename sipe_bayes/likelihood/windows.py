@@ -255,8 +255,8 @@ class Windows:
     def compared_late(self) -> Windows:
         """The same, simulated on and compared as those of the latest model of ``settings.late``.
 
-        Where a model has a late sensor, windows are compared from later on. Their starts are then less well known, and
-        cost less: nats that a model without would pay for nothing that it lacks.
+        Where a model has a late sensor, segments are compared from later samples on. So their initial states are less
+        well known and cost less evidence. All models are compared on the same samples for that reason.
         """
         late = np.array([dict(self.settings.late).get(name, 0.0) for name in self.fitted])
         if not late.any():
@@ -385,7 +385,7 @@ class Windows:
         return predicted, np.asarray((good | ~needed).all(axis=(1, 2)))
 
     def simulate(self, theta: FloatArray) -> FloatArray:
-        """Predictions (B, W, L, C) of thetas (B, N) from the windows' own starts.
+        """Predictions (B, W, L, C) of thetas (B, N) from the measured initial states.
 
         Raises:
             BudgetExhausted: instead of simulating beyond the budget.
