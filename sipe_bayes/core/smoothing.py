@@ -6,8 +6,10 @@ A. Savitzky, M. Golay 1964, "Smoothing and differentiation of data by simplified
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
-from scipy.signal import savgol_coeffs, savgol_filter
+from scipy.signal import savgol_coeffs
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.rotations import added, between
@@ -25,7 +27,10 @@ def smoothed(series: FloatArray, dt: float, derivative: int = 0, wider: int = 1)
     span = _span(len(series), dt, wider)
     if span < 3:
         return np.gradient(series, dt, axis=0) if derivative else series
-    return np.asarray(savgol_filter(series, span, 2, derivative, delta=dt, axis=0))
+    weights, half, inner = _weights(span, derivative), span // 2, len(series) - span + 1
+    middle = sum(weight * series[k : k + inner] for k, weight in enumerate(weights[half]))
+    begin, end = (np.tensordot(w, s, 1) for w, s in ((weights[:half], series[:span]), (weights[-half:], series[-span:])))
+    return np.concatenate([begin, middle, end]) / dt**derivative
 
 
 def filled(series: FloatArray) -> FloatArray:
@@ -41,7 +46,7 @@ def filled(series: FloatArray) -> FloatArray:
 def left_by_smoothing(count: int, dt: float) -> float:
     """Share of white noise's variance in samples less ``smoothed``, away from their ends; 0 of fewer than five."""
     span = _span(count, dt)
-    return 0.0 if span < 5 else float(1 - savgol_coeffs(span, 2)[span // 2])
+    return 0.0 if span < 5 else float(1 - _weights(span, 0)[span // 2, span // 2])
 
 
 def smoothed_rotations(vectors: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
@@ -55,14 +60,17 @@ def smoothed_rotations(vectors: FloatArray, dt: float) -> tuple[FloatArray, Floa
         return vectors, np.concatenate([turn, turn[-1:]])[:count]
     begin = np.clip(np.arange(count) - span // 2, 0, count - span)
     ways, place = between(vectors[begin[:, None] + np.arange(span)], vectors[:, None]), np.arange(count) - begin
-    smooth, slope = (
-        np.stack([savgol_coeffs(span, 2, derivative, dt, at, "dot") for at in range(span)])[place]
-        for derivative in (0, 1)
-    )
-    return added(vectors, np.einsum("ks,ksi->ki", smooth, ways)), np.einsum("ks,ksi->ki", slope, ways)
+    smooth, slope = (np.einsum("ks,ksi->ki", _weights(span, derivative)[place], ways) for derivative in (0, 1))
+    return added(vectors, smooth), slope / dt
 
 
 def _span(count: int, dt: float, wider: int = 1) -> int:
     """Samples of a local quadratic, an odd number."""
     half = wider * (max(5, 2 * round(0.06 / dt / 2) + 1) // 2)
     return min(2 * half + 1, count - (count + 1) % 2)
+
+
+@functools.lru_cache(maxsize=256)
+def _weights(span: int, derivative: int) -> FloatArray:
+    """Weights (span, span) of samples in the value, or the slope by sample, of their quadratic at each of them."""
+    return np.stack([savgol_coeffs(span, 2, derivative, pos=at, use="dot") for at in range(span)])

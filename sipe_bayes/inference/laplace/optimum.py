@@ -202,7 +202,7 @@ def summarised(
     for weight, point in noise_cloud(moments, noise, here, free_noise(windows), windows.trajectories.longest):
         if sandwiched:
             middle = sandwich(lin.jacobian, solved.slope, white, windows.sequences, point)
-            centre, spread = problem.normal(theta, *_sandwiched(solved, middle, here.free))
+            centre, spread = problem.normal(theta, _sandwiched(solved, middle), np.zeros(len(theta)))
         else:
             point = beyond_rounding(windows, point)
             inner = windows.eliminate(moments.normal(point), moments.num_theta, starts)
@@ -215,18 +215,12 @@ def summarised(
     return WindowOptimum(theta, mean, covariance, evidence, noise.sd, noise.tau, starts, solved.slope)
 
 
-def _sandwiched(solved: Eliminated, middle: FloatArray, free: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Precision and gradient of plain least squares when the residuals' covariance gives ``middle`` (N, N).
-
-    Parameters that a bound holds, not ``free`` (N,), stay there: the sandwich does not say where others would follow.
-    """
-    shift, inner = np.zeros(len(free)), solved.precision[np.ix_(free, free)]
-    shift[free] = np.linalg.pinv(inner, rcond=1e-12, hermitian=True) @ solved.gradient[free]
+def _sandwiched(solved: Eliminated, middle: FloatArray) -> FloatArray:
+    """Precision (N, N) of plain least squares when the residuals' covariance gives ``middle`` (N, N)."""
     precision = solved.precision @ np.linalg.pinv(middle, rcond=1e-12, hermitian=True) @ solved.precision
     # rounding leaves some of an open direction negative
     eigenvalues, axes = np.linalg.eigh(0.5 * (precision + precision.T))
-    precision = (axes * np.maximum(eigenvalues, 0.0)) @ axes.T
-    return precision, precision @ shift
+    return np.asarray((axes * np.maximum(eigenvalues, 0.0)) @ axes.T)
 
 
 def not_followed(windows: Windows, sd: FloatArray) -> tuple[str, float] | None:

@@ -109,6 +109,7 @@ class Here:
     starts_jacobian: FloatArray | None = None  # (K, L, C, D), kept; None where it is to be taken anew
     misfit: float = 0.0  # of the first residuals, in units of the channels' spread
     exact: bool = False  # whether the step before gained what was expected, so that its kept columns still hold
+    gained: float = np.inf  # nats, by the step before
     white: bool = False  # whether the noise is white, as the configuration or the comparison asks
 
 
@@ -157,8 +158,8 @@ class _Trial(NamedTuple):
 class _PlainStep(NamedTuple):
     """A step of plain least squares: where the fit stands after it, and linearisation and Hessian (N, N) before it.
 
-    energy: after it, nats; gained: not above zero where no step lowered the energy; stuck: whether none is worth trying
-    any more.
+    energy: after it, nats; gained: not above zero where no step lowered the energy; expected: of the step that was
+    taken, by the linearisation; stuck: whether none is worth trying any more.
     """
 
     after: Here
@@ -166,11 +167,16 @@ class _PlainStep(NamedTuple):
     hessian: FloatArray
     energy: float
     gained: float
+    expected: float
     stuck: bool
 
     def ends(self, enough: float) -> bool:
-        """Whether a fit stands still that gains ``enough`` nats or fewer."""
-        return self.stuck or 0 < self.gained <= enough
+        """Whether a fit stands still whose next step gains ``enough`` nats or fewer: by what this one was foretold.
+
+        Newton's errors are squared from step to step, so the next gain is this one times the square of its surprise.
+        """
+        surprise = self.gained / self.expected - 1 if self.expected > 0 else np.inf
+        return self.stuck or 0 < self.gained * min(surprise**2, 1.0) <= enough
 
 
 class _End(NamedTuple):
@@ -295,9 +301,13 @@ class SegmentSolver:
         """How many segments the fit uses in the end."""
         return len(self._view(self._last(Stage.FIT))[0])
 
-    def _last(self, stage: Stage) -> int:
-        """The largest part that a stage simulates."""
-        return len(self._beginnings) + (1 if stage is Stage.PLAIN else 2)
+    def _last(self, stage: Stage, white: bool = False) -> int:
+        """The largest part that a stage simulates; ``white``: where plain least squares have the last word."""
+        return len(self._beginnings) + (1 if stage is Stage.PLAIN and not white else 2)
+
+    def _takes_over(self, here: Here) -> bool:
+        """Whether plain least squares have taken over from coloured noise."""
+        return here.white and self.windows.settings.noise == "ar1"
 
     def _as_measured(self, view: Windows) -> Windows:
         """Segments whose initial states are known as well as smoothed measurements tell them."""
@@ -305,10 +315,10 @@ class SegmentSolver:
         view.start_precision = view.measured_precision
         return view
 
-    def _next_part(self, stage: Stage, part: int) -> int | None:
+    def _next_part(self, stage: Stage, part: int, white: bool = False) -> int | None:
         """The next part with more segments; None where there is none."""
         size = self._view(part)[1].observed.size
-        for other in range(part + 1, self._last(stage) + 1):
+        for other in range(part + 1, self._last(stage, white) + 1):
             if self._view(other)[1].observed.size > size:
                 return other
         return None
@@ -399,8 +409,9 @@ class SegmentSolver:
             step = self._plain_step(view, here)
         if not step.lin.valid:  # diverges on what the part before did not hold
             return replace(state, here=replace(here, stage=Stage.FIT, residual=None, starts_jacobian=None))
-        after, more = step.after, self._next_part(Stage.PLAIN, here.part)
-        enough = self.tuning.plain_gain * view.num_theta * (10.0 if here.part == 0 and more else 1.0)
+        after, more = step.after, self._next_part(Stage.PLAIN, here.part, self._takes_over(here))
+        exactness = 0.1 if self._takes_over(here) else 10.0 if here.part == 0 and more else 1.0
+        enough = exactness * self._plain_enough(view, step.lin.residual)
         if not step.ends(enough) and after.iteration < self.tuning.most_steps:
             return replace(state, here=after)
         if here.part == 0 and self._beginnings and len(state.ends) < len(state.points):
@@ -427,7 +438,8 @@ class SegmentSolver:
         def energy_of(theta: FloatArray, _: FloatArray, residual: FloatArray) -> float:
             return self._profile(view, residual) + self.prior.energy(theta)
 
-        best, residual, lowest = best_step(view, thetas, view.no_starts(len(thetas)), energy_of)
+        enough = self._plain_enough(view, lin.residual) * (0.1 if self._takes_over(here) else 1.0)
+        best, residual, lowest = best_step(view, thetas, view.no_starts(len(thetas)), energy_of, energy, enough)
         gained, damping = energy - lowest, float(here.damping * _DAMPINGS[best])
         scale, after = self._scaled(view, precision, None), replace(here, iteration=here.iteration + 1)
         after = replace(after, scale=scale, axes=self._axes(view, here.theta, hessian, scale), noise=noise)
@@ -436,8 +448,18 @@ class SegmentSolver:
             after = replace(after, theta=thetas[best], residual=residual, damping=self._damped(damping))
         else:
             after = replace(after, residual=lin.residual, damping=self._damped(damping * _DAMPINGS[-1]))
-        stuck = gained <= 0 and here.damping >= 1.0
-        return _PlainStep(after, lin, hessian, min(energy, lowest), gained, stuck)
+        move = thetas[best] - here.theta
+        expected, stuck = float(pull @ move - 0.5 * move @ hessian @ move), gained <= 0 and here.damping >= 1.0
+        return _PlainStep(after, lin, hessian, min(energy, lowest), gained, expected, stuck)
+
+    def _plain_enough(self, view: Windows, residual: FloatArray) -> float:
+        """Nats that plain least squares may leave: more where a residual (K, L, C) follows itself, and counts for less."""
+        ratios = []
+        for c, sequence in enumerate(view.sequences):
+            z = residual[:, :, c].ravel()[sequence.index]
+            follows = float(z[1:] @ z[:-1]) / max(float(z @ z), 1e-300)
+            ratios.append((1 + np.clip(follows, 0.0, 0.98)) / (1 - np.clip(follows, 0.0, 0.98)))
+        return float(self.tuning.plain_gain * view.num_theta * np.exp(np.log(ratios).mean()))
 
     def _scouted(self, state: SolverState, here: Here, energy: float) -> tuple[SolverState, Here]:
         """After a plain fit of the smallest part: from the next starting point, or on from the best end of all."""
@@ -494,10 +516,13 @@ class SegmentSolver:
                 lin, fresh, scale = self._linearised(view, replace(here, starts_jacobian=None), here.starts[keep])
             if state.stage_begins and self.tuning.compares:
                 takes_over, wider = self._noise_takes_over(view, here, lin)
-                here = replace(here, white=takes_over)
-                view = self._as_measured(view) if takes_over else view
                 state = replace(state, compared=True, wider=wider if takes_over else 1.0)
+                if takes_over:
+                    return self._least_squares(state)
             moments = view.moments(lin, white=here.white)
+            if self._takes_over(here):
+                here = replace(here, noise=present_noise(view, lin.residual))
+                return self._ended(state, here, lin, moments, keep, view, True)
             noise = here.noise
             if here.iteration == 0 or (here.stage is Stage.FIT and not here.noise.tau.any()):
                 noise = present_noise(view, lin.residual)
@@ -512,8 +537,10 @@ class SegmentSolver:
             scale=scale if lengths is None else lengths[0],
             axes=here.axes if lengths is None else lengths[1],
             misfit=here.misfit or misfit(view, lin.residual),
+            gained=trial.gained,
         )
-        small = trial.expected < tolerance or (trial.gained < tolerance and here.damping <= 1.0)
+        slow = trial.gained < tolerance and (here.damping <= 1.0 or here.gained < tolerance)
+        small = trial.expected < tolerance or slow
         settled = small and same_noise(noise, here.noise)
         stuck = trial.gained <= 0 and here.damping >= 1e3
         elsewhere = bool(np.isfinite(state.ends).any()) and after.iteration >= _SCOUTED_STEPS
@@ -540,6 +567,11 @@ class SegmentSolver:
         starts[keep] = trial.starts
         after = replace(after, theta=trial.theta, starts=starts, residual=trial.residual)
         return replace(state, here=replace(after, damping=self._damped(trial.damping)))
+
+    def _least_squares(self, state: SolverState) -> SolverState:
+        """On from the plain fit by plain least squares, on as many segments as there are."""
+        part = self._last(Stage.PLAIN, white=True)
+        return replace(state, here=replace(self._begin(state.plain), part=part, white=True))
 
     def _noise_takes_over(self, view: Windows, here: Here, lin: Linearisation) -> tuple[bool, float]:
         """Whether coloured noise would move theta farther from plain least squares than coloured noise itself could.
@@ -611,7 +643,7 @@ class SegmentSolver:
             thetas.append(theta)
             changes.append(solved.blocks(move))
         stacked, all_starts = np.stack(thetas), starts + np.stack(changes)
-        best, residual, lowest = best_step(view, stacked, all_starts, energy)
+        best, residual, lowest = best_step(view, stacked, all_starts, energy, now, tolerance)
         damping = float(here.damping * _DAMPINGS[best])
         return _Trial(stacked[best], all_starts[best], residual, now - lowest, expected, damping), scale
 
@@ -729,9 +761,7 @@ class SegmentSolver:
             return self._finish(state)
         early = replace(best, finding=finding(Code.SEARCH_CUT_SHORT), early=True)
         self.problem.tell("white noise, from the plain fit", self.windows.rollouts)
-        part = self._last(Stage.PLAIN)
-        here = replace(self._begin(state.plain), stage=Stage.FIT, part=part, white=True)
-        return replace(state, optima=(early,), here=here)
+        return self._least_squares(replace(state, optima=(early,)))
 
     def free_run_errors(self, theta: FloatArray, plain: FloatArray) -> tuple[float, float]:
         """Free-run errors of theta (N,) and of ``plain`` (N,): geometric means over logs and channels.
@@ -852,7 +882,7 @@ class SegmentSolver:
                 return None  # within two sds, on its way to that end
             if left < 6 and energy - left * max(step.gained, 0.0) > worst:
                 return None  # at this pace it does not get there
-            if step.ends(self.tuning.plain_gain * n):
+            if step.ends(self._plain_enough(view, step.lin.residual)):
                 break
         return None if energy > worst else _End(here.theta, energy, step.hessian)
 
@@ -896,12 +926,19 @@ def best_step(
     thetas: FloatArray,
     starts: FloatArray,
     energy: Callable[[FloatArray, FloatArray, FloatArray], float],
+    now: float,
+    slack: float,
 ) -> tuple[int, FloatArray, float]:
-    """Of steps to thetas (M, N) and starts (M, W, D) that which leads lowest: its number, residual and energy."""
+    """Of ever shorter steps to thetas (M, N) and starts (M, W, D) the best one: its number, residual and energy.
+
+    It is the shortest that gains all but ``slack`` nats of what the best gains, and half of that, from an energy ``now``:
+    where a log tells little, parameters stay near the model as given.
+    """
     residuals, valid = view.residuals(thetas, starts)
     each = zip(thetas, starts, residuals, valid, strict=True)
     values = np.array([energy(t, s, r) if ok else np.inf for t, s, r, ok in each])
-    best = int(values.argmin())
+    lowest = float(values.min())
+    best = int(np.flatnonzero(values <= lowest + min(slack, max(0.5 * (now - lowest), 0.0)))[-1])
     return best, residuals[best], float(values[best])
 
 

@@ -70,7 +70,7 @@ class WideTuning:
     most_theta_step: ClassVar[float] = 0.1  # longest one: a line is none across the cube (of the cube)
     least_state_step: ClassVar[float] = 1e-6  # shortest difference by states: rounding (rad or m, and a second)
     most_state_step: ClassVar[float] = 0.3  # longest one: a line is none across a step (of the movement)
-    linearisations: ClassVar[int] = 10  # taken about an optimum through contact, for the scatter of its mean
+    linearisations: ClassVar[int] = 5  # taken about an optimum through contact, for the scatter of its mean
 
 
 class ChainTuning:
