@@ -20,9 +20,6 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
 **Differences** of theta run along the principal axes of the posterior and are a third of its sd along each. So slopes
 are those of the posterior's width, whatever dry friction or a delay does below it.
 
-**More starting points** are followed only where the fit is poor: residuals larger than ``poor`` times what samples
-scatter by. They are the best of a few draws from the prior, fitted as in 1; the best end is kept.
-
 **Other optima** that fit as well are looked for after the fit, unless ``restarts`` is one. Two distances of a centre of
 mass from its joint give a pendulum one period, for example. From four points far from the optimum, plain fits go down:
 on so few segments that all take a twentieth of what the fit took. One that ends elsewhere and fits as well goes on with
@@ -121,7 +118,6 @@ class SolverState(WindowState):
     plain: FloatArray = field(default_factory=lambda: np.zeros(0))  # (N,), from the first starting point; empty before
     compared: bool = False  # whether coloured noise has been held against plain least squares
     freed: bool = False  # whether the mode's free-run error has been compared with the plain fit's
-    scouted: bool = False  # whether further starting points were tried
     wider: float = 1.0  # times the variance of plain least squares that coloured residuals make of a white one
     behind: float = 0.0  # how many times the plain fit's that error was; 0 where it was not larger
     ends: tuple[float, ...] = ()  # energies of plain fits of the shortest beginnings, by starting point through impacts
@@ -223,8 +219,9 @@ class SegmentSolver:
         assert isinstance(state, SolverState)
         if len(state.points) >= self.tuning.most_points or self._leaves_no_room():
             return None
-        here = replace(self._begin(theta), stage=Stage.FIT, white=state.here.white)
-        here = here if starts is None else replace(here, starts=starts, part=self._last(Stage.FIT))
+        here = self._begin_fit(theta, state.here.white)
+        if starts is not None and here.stage is Stage.FIT:
+            here = replace(here, starts=starts, part=self._last(Stage.FIT))
         points = np.concatenate([state.points, theta[None]])
         return replace(state, points=points, point=len(state.points), here=here, elsewhere=False, ends=(), done=False)
 
@@ -518,7 +515,7 @@ class SegmentSolver:
                 takes_over, wider = self._noise_takes_over(view, here, lin)
                 state = replace(state, compared=True, wider=wider if takes_over else 1.0)
                 if takes_over:
-                    return self._least_squares(state)
+                    return replace(state, here=self._begin_fit(state.plain, white=True))
             moments = view.moments(lin, white=here.white)
             if self._takes_over(here):
                 here = replace(here, noise=present_noise(view, lin.residual))
@@ -568,10 +565,12 @@ class SegmentSolver:
         after = replace(after, theta=trial.theta, starts=starts, residual=trial.residual)
         return replace(state, here=replace(after, damping=self._damped(trial.damping)))
 
-    def _least_squares(self, state: SolverState) -> SolverState:
-        """On from the plain fit by plain least squares, on as many segments as there are."""
-        part = self._last(Stage.PLAIN, white=True)
-        return replace(state, here=replace(self._begin(state.plain), part=part, white=True))
+    def _begin_fit(self, theta: FloatArray, white: bool) -> Here:
+        """From theta (N,) where plain least squares have been: on by them on all segments, or by FIT on the first."""
+        here = replace(self._begin(theta), white=white)
+        if self._takes_over(here):
+            return replace(here, part=self._last(Stage.PLAIN, white=True))
+        return replace(here, stage=Stage.FIT)
 
     def _noise_takes_over(self, view: Windows, here: Here, lin: Linearisation) -> tuple[bool, float]:
         """Whether coloured noise would move theta farther from plain least squares than coloured noise itself could.
@@ -704,8 +703,6 @@ class SegmentSolver:
             points = self.screened(optimum.theta, _THROUGH_IMPACTS, state.rounds + 1)[0]
             again = replace(state, points=points, point=0, ends=(), reached=(), rounds=state.rounds + 1)
             return replace(again, here=self._begin(points[0]))
-        if not self._beginnings and self._is_poor(optimum) and not state.scouted and self.problem.options.restarts > 1:
-            return self._further(state)
         if state.point + 1 < len(state.points):
             point = state.point + 1
             return replace(state, point=point, here=self._begin(state.points[point]))
@@ -726,27 +723,6 @@ class SegmentSolver:
         large = optimum.sd > 0.1 * windows.spread
         return bool((large & (optimum.sd > self.tuning.poor * windows.level.sd)).any())
 
-    def _further(self, state: SolverState) -> SolverState:
-        """Further starting points: the best of draws from the prior that are not near the optimum."""
-        view = self._view(0)[1]
-        options = self.problem.options
-        generator = torch.Generator().manual_seed(self.problem.seed + 1)
-        drawn = self.problem.prior.sample((max(options.candidates, 1),), generator=generator).numpy()
-        try:
-            with self.windows.counting(view):
-                residual, valid = view.residuals(drawn, view.no_starts(len(drawn)))
-        except BudgetExhausted:
-            self.windows.short = True
-            return replace(state, scouted=True, done=True)
-        loss = np.array([self._profile(view, r) if ok else np.inf for r, ok in zip(residual, valid, strict=True)])
-        away = np.linalg.norm(drawn - state.optima[-1].theta, axis=1)
-        loss = np.where(away >= np.median(away), loss, np.inf)  # near ones end at the same optimum
-        order = np.argsort(loss, kind="stable")[: min(options.restarts - 1, int(np.isfinite(loss).sum()))]
-        points = np.concatenate([state.points, drawn[order]])
-        if not len(order):
-            return replace(state, scouted=True, done=True)
-        return replace(state, points=points, scouted=True, point=state.point + 1, here=self._begin(drawn[order[0]]))
-
     def _compare(self, state: SolverState) -> SolverState:
         """Hold the mode's free-run error against the plain fit's."""
         best = max(state.optima, key=lambda one: one.evidence)
@@ -761,7 +737,7 @@ class SegmentSolver:
             return self._finish(state)
         early = replace(best, finding=finding(Code.SEARCH_CUT_SHORT), early=True)
         self.problem.tell("white noise, from the plain fit", self.windows.rollouts)
-        return self._least_squares(replace(state, optima=(early,)))
+        return replace(state, optima=(early,), here=self._begin_fit(state.plain, white=True))
 
     def free_run_errors(self, theta: FloatArray, plain: FloatArray) -> tuple[float, float]:
         """Free-run errors of theta (N,) and of ``plain`` (N,): geometric means over logs and channels.
@@ -811,8 +787,7 @@ class SegmentSolver:
             windows.short, theta = True, None
         if theta is None:
             return replace(state, done=True)
-        here = replace(self._begin(theta), stage=Stage.FIT, white=state.here.white)
-        points = np.concatenate([state.points, theta[None]])
+        points, here = np.concatenate([state.points, theta[None]]), self._begin_fit(theta, state.here.white)
         return replace(state, points=points, point=len(state.points), here=here, elsewhere=True)
 
     def _is_worth_looking(self, state: SolverState) -> bool:
@@ -822,7 +797,7 @@ class SegmentSolver:
         asked = options.restarts > 1 and options.initial is None and len(state.points) < self.tuning.most_points
         asked = asked and not self._beginnings
         new = not any(one.holds(state.optima[-1]) for one in state.optima[:-1])
-        return asked and tells and new and not state.scouted and all(one.finding is None for one in state.optima)
+        return asked and tells and new and all(one.finding is None for one in state.optima)
 
     def _find_elsewhere(self, state: SolverState) -> FloatArray | None:
         """Where plain least squares fit as well as at the optima, theta (N,); None if nowhere.
@@ -831,6 +806,7 @@ class SegmentSolver:
         """
         last, n, optima = state.optima[-1], self.windows.num_theta, [one.theta for one in state.optima]
         points = self._pick_far(last.theta, np.diag(last.covariance) < 0.1**2)  # of others the log says little
+        points += self._pick_drawn(last.theta) if self._is_poor(last) else []
         few = self._take_few((6 * len(points) + 2 * len(optima)) * (n + 3))  # most take six steps, from an optimum two
         for view in (few, self._view(0)[1]):
             if not points:
@@ -858,6 +834,18 @@ class SegmentSolver:
             up = generator.random(len(theta)) < 0.5
             out += [np.where(narrow, theta + way * (side - theta), theta) for side in (up, ~up)]
         return out
+
+    def _pick_drawn(self, theta: FloatArray) -> list[FloatArray]:
+        """The best of draws from the prior that are not near theta (N,)."""
+        view, options = self._view(0)[1], self.problem.options
+        generator = torch.Generator().manual_seed(self.problem.seed + 1)
+        drawn = self.problem.prior.sample((max(options.candidates, 1),), generator=generator).numpy()
+        with self.windows.counting(view):
+            residual, valid = view.residuals(drawn, view.no_starts(len(drawn)))
+        loss = np.array([self._profile(view, r) if ok else np.inf for r, ok in zip(residual, valid, strict=True)])
+        away = np.linalg.norm(drawn - theta, axis=1)
+        loss = np.where(away >= np.median(away), loss, np.inf)  # near ones end at the same optimum
+        return list(drawn[np.argsort(loss, kind="stable")[: min(options.restarts - 1, int(np.isfinite(loss).sum()))]])
 
     def _take_few(self, thetas: int) -> Windows:
         """So few segments that simulations of ``thetas`` take a twentieth of what the fit took, mostly less; or two."""
