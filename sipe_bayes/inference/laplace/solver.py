@@ -303,8 +303,8 @@ class SegmentSolver:
         return len(self._beginnings) + (1 if stage is Stage.PLAIN and not white else 2)
 
     def _takes_over(self, here: Here) -> bool:
-        """Whether plain least squares have taken over from coloured noise."""
-        return here.white and self.windows.settings.noise == "ar1"
+        """Whether plain least squares have taken over from coloured noise, and initial states are as measured."""
+        return here.white and self.windows.settings.noise == "ar1" and self.windows.rates_measured
 
     def _as_measured(self, view: Windows) -> Windows:
         """Segments whose initial states are known as well as smoothed measurements tell them."""
@@ -513,8 +513,10 @@ class SegmentSolver:
                 lin, fresh, scale = self._linearised(view, replace(here, starts_jacobian=None), here.starts[keep])
             if state.stage_begins and self.tuning.compares:
                 takes_over, wider = self._noise_takes_over(view, here, lin)
+                here = replace(here, white=takes_over)
+                view = self._as_measured(view) if takes_over else view
                 state = replace(state, compared=True, wider=wider if takes_over else 1.0)
-                if takes_over:
+                if self._takes_over(here):
                     return replace(state, here=self._begin_fit(state.plain, white=True))
             moments = view.moments(lin, white=here.white)
             if self._takes_over(here):
@@ -790,23 +792,31 @@ class SegmentSolver:
         points, here = np.concatenate([state.points, theta[None]]), self._begin_fit(theta, state.here.white)
         return replace(state, points=points, point=len(state.points), here=here, elsewhere=True)
 
+    @property
+    def _tells(self) -> bool:
+        """Whether a plain fit tells anything: initial states are measured."""
+        return self.windows.starts_measured or self.windows.rates_measured
+
     def _is_worth_looking(self, state: SolverState) -> bool:
-        """Whether another optimum is worth looking for: plain fits tell, the fit has converged and is no poor one."""
-        options, windows = self.problem.options, self.windows
-        tells = windows.starts_measured or windows.rates_measured
-        asked = options.restarts > 1 and options.initial is None and len(state.points) < self.tuning.most_points
-        asked = asked and not self._beginnings
-        new = not any(one.holds(state.optima[-1]) for one in state.optima[:-1])
-        return asked and tells and new and all(one.finding is None for one in state.optima)
+        """Whether another optimum is worth looking for: from a poor fit, or from one that has converged."""
+        options, ends = self.problem.options, [one for one in state.optima if not one.early]
+        most = self.tuning.most_points if self._tells else options.restarts
+        asked = options.restarts > 1 and options.initial is None and len(state.points) < most
+        if not asked or self._beginnings or any(one.holds(ends[-1]) for one in ends[:-1]):
+            return False
+        return self._is_poor(ends[-1]) or (self._tells and all(one.finding is None for one in state.optima))
 
     def _find_elsewhere(self, state: SolverState) -> FloatArray | None:
         """Where plain least squares fit as well as at the optima, theta (N,); None if nowhere.
 
-        From points far from the last optimum: on a few segments first, then on the smallest part.
+        From points far from the last optimum, and where that is poor from draws: on a few segments first, then on the
+        smallest part. Where initial states are not measured it is the best draw itself.
         """
         last, n, optima = state.optima[-1], self.windows.num_theta, [one.theta for one in state.optima]
-        points = self._pick_far(last.theta, np.diag(last.covariance) < 0.1**2)  # of others the log says little
-        points += self._pick_drawn(last.theta) if self._is_poor(last) else []
+        points = self._pick_drawn(state) if self._is_poor(last) else []
+        if not self._tells:
+            return next(iter(points), None)
+        points += self._pick_far(last.theta, np.diag(last.covariance) < 0.1**2)  # of others the log says little
         few = self._take_few((6 * len(points) + 2 * len(optima)) * (n + 3))  # most take six steps, from an optimum two
         for view in (few, self._view(0)[1]):
             if not points:
@@ -835,15 +845,15 @@ class SegmentSolver:
             out += [np.where(narrow, theta + way * (side - theta), theta) for side in (up, ~up)]
         return out
 
-    def _pick_drawn(self, theta: FloatArray) -> list[FloatArray]:
-        """The best of draws from the prior that are not near theta (N,)."""
+    def _pick_drawn(self, state: SolverState) -> list[FloatArray]:
+        """The best of draws from the prior that are not near the last optimum."""
         view, options = self._view(0)[1], self.problem.options
-        generator = torch.Generator().manual_seed(self.problem.seed + 1)
+        generator = torch.Generator().manual_seed(self.problem.seed + len(state.points))
         drawn = self.problem.prior.sample((max(options.candidates, 1),), generator=generator).numpy()
         with self.windows.counting(view):
             residual, valid = view.residuals(drawn, view.no_starts(len(drawn)))
         loss = np.array([self._profile(view, r) if ok else np.inf for r, ok in zip(residual, valid, strict=True)])
-        away = np.linalg.norm(drawn - theta, axis=1)
+        away = np.linalg.norm(drawn - state.optima[-1].theta, axis=1)
         loss = np.where(away >= np.median(away), loss, np.inf)  # near ones end at the same optimum
         return list(drawn[np.argsort(loss, kind="stable")[: min(options.restarts - 1, int(np.isfinite(loss).sum()))]])
 
@@ -890,7 +900,7 @@ class SegmentSolver:
 
     def _is_behind(self, state: SolverState, here: Here, keep: IntArray, view: Windows) -> bool:
         """Whether the best optimum fits the segments (K,) of a part better by more nats than ``distinct`` keeps."""
-        best = max((one for one in state.optima if one.finding is None), key=lambda one: one.evidence)
+        best = max((one for one in state.optima if not one.early), key=lambda one: one.evidence)
         thetas, starts = np.stack([best.theta, here.theta]), np.stack([best.starts[keep], here.starts[keep]])
         with self.windows.counting(view):
             residual, valid = view.residuals(thetas, starts)
