@@ -107,6 +107,7 @@ class Here:
     misfit: float = 0.0  # of the first residuals, in units of the channels' spread
     exact: bool = False  # whether the step before gained what was expected, so that its kept columns still hold
     gained: float = np.inf  # nats, by the step before
+    enough: float = 0.0  # nats that plain least squares may leave; 0: as their residual tells
     white: bool = False  # whether the noise is white, as the configuration or the comparison asks
 
 
@@ -166,12 +167,12 @@ class _PlainStep(NamedTuple):
     expected: float
     stuck: bool
 
-    def ends(self, enough: float) -> bool:
-        """Whether a fit stands still whose next step gains ``enough`` nats or fewer: by what this one was foretold.
+    def ends(self, enough: float, foretold: bool = True) -> bool:
+        """Whether a fit stands still that gains ``enough`` nats or fewer; ``foretold``: by its next step.
 
         Newton's errors are squared from step to step, so the next gain is this one times the square of its surprise.
         """
-        surprise = self.gained / self.expected - 1 if self.expected > 0 else np.inf
+        surprise = self.gained / self.expected - 1 if self.expected > 0 and foretold else np.inf
         return self.stuck or 0 < self.gained * min(surprise**2, 1.0) <= enough
 
 
@@ -219,7 +220,7 @@ class SegmentSolver:
         assert isinstance(state, SolverState)
         if len(state.points) >= self.tuning.most_points or self._leaves_no_room():
             return None
-        here = self._begin_fit(theta, state.here.white)
+        here = self._begin_fit(state, theta, state.here.white)
         if starts is not None and here.stage is Stage.FIT:
             here = replace(here, starts=starts, part=self._last(Stage.FIT))
         points = np.concatenate([state.points, theta[None]])
@@ -407,9 +408,8 @@ class SegmentSolver:
         if not step.lin.valid:  # diverges on what the part before did not hold
             return replace(state, here=replace(here, stage=Stage.FIT, residual=None, starts_jacobian=None))
         after, more = step.after, self._next_part(Stage.PLAIN, here.part, self._takes_over(here))
-        exactness = 0.1 if self._takes_over(here) else 10.0 if here.part == 0 and more else 1.0
-        enough = exactness * self._plain_enough(view, step.lin.residual)
-        if not step.ends(enough) and after.iteration < self.tuning.most_steps:
+        enough = self._plain_enough(view, here, step.lin.residual) * (10.0 if here.part == 0 and more else 1.0)
+        if not step.ends(enough, foretold=not here.enough) and after.iteration < self.tuning.most_steps:
             return replace(state, here=after)
         if here.part == 0 and self._beginnings and len(state.ends) < len(state.points):
             state, after = self._scouted(state, after, step.energy)
@@ -435,7 +435,7 @@ class SegmentSolver:
         def energy_of(theta: FloatArray, _: FloatArray, residual: FloatArray) -> float:
             return self._profile(view, residual) + self.prior.energy(theta)
 
-        enough = self._plain_enough(view, lin.residual) * (0.1 if self._takes_over(here) else 1.0)
+        enough = self._plain_enough(view, here, lin.residual)
         best, residual, lowest = best_step(view, thetas, view.no_starts(len(thetas)), energy_of, energy, enough)
         gained, damping = energy - lowest, float(here.damping * _DAMPINGS[best])
         scale, after = self._scaled(view, precision, None), replace(here, iteration=here.iteration + 1)
@@ -449,8 +449,10 @@ class SegmentSolver:
         expected, stuck = float(pull @ move - 0.5 * move @ hessian @ move), gained <= 0 and here.damping >= 1.0
         return _PlainStep(after, lin, hessian, min(energy, lowest), gained, expected, stuck)
 
-    def _plain_enough(self, view: Windows, residual: FloatArray) -> float:
+    def _plain_enough(self, view: Windows, here: Here, residual: FloatArray) -> float:
         """Nats that plain least squares may leave: more where a residual (K, L, C) follows itself, and counts for less."""
+        if here.enough:
+            return here.enough
         ratios = []
         for c, sequence in enumerate(view.sequences):
             z = residual[:, :, c].ravel()[sequence.index]
@@ -515,9 +517,9 @@ class SegmentSolver:
                 takes_over, wider = self._noise_takes_over(view, here, lin)
                 here = replace(here, white=takes_over)
                 view = self._as_measured(view) if takes_over else view
-                state = replace(state, compared=True, wider=wider if takes_over else 1.0)
+                state = replace(state, compared=True, wider=wider)
                 if self._takes_over(here):
-                    return replace(state, here=self._begin_fit(state.plain, white=True))
+                    return replace(state, here=self._begin_fit(state, state.plain, white=True))
             moments = view.moments(lin, white=here.white)
             if self._takes_over(here):
                 here = replace(here, noise=present_noise(view, lin.residual))
@@ -526,7 +528,7 @@ class SegmentSolver:
             if here.iteration == 0 or (here.stage is Stage.FIT and not here.noise.tau.any()):
                 noise = present_noise(view, lin.residual)
             noise = updated_noise(view, moments, noise, here.theta, here.starts[keep], self.prior, not here.white)
-            tolerance = self.tuning.tolerance * max(view.num_theta, 1) * state.wider
+            tolerance = self.tuning.tolerance * max(view.num_theta, 1) * (state.wider if here.white else 1.0)
             trial, lengths = self._tried(view, here, lin, moments, noise, here.starts[keep], tolerance)
         after = replace(
             here,
@@ -567,11 +569,12 @@ class SegmentSolver:
         after = replace(after, theta=trial.theta, starts=starts, residual=trial.residual)
         return replace(state, here=replace(after, damping=self._damped(trial.damping)))
 
-    def _begin_fit(self, theta: FloatArray, white: bool) -> Here:
+    def _begin_fit(self, state: SolverState, theta: FloatArray, white: bool) -> Here:
         """From theta (N,) where plain least squares have been: on by them on all segments, or by FIT on the first."""
         here = replace(self._begin(theta), white=white)
         if self._takes_over(here):
-            return replace(here, part=self._last(Stage.PLAIN, white=True))
+            enough = self.tuning.tolerance * len(theta) * state.wider
+            return replace(here, part=self._last(Stage.PLAIN, white=True), enough=enough)
         return replace(here, stage=Stage.FIT)
 
     def _noise_takes_over(self, view: Windows, here: Here, lin: Linearisation) -> tuple[bool, float]:
@@ -739,7 +742,7 @@ class SegmentSolver:
             return self._finish(state)
         early = replace(best, finding=finding(Code.SEARCH_CUT_SHORT), early=True)
         self.problem.tell("white noise, from the plain fit", self.windows.rollouts)
-        return replace(state, optima=(early,), here=self._begin_fit(state.plain, white=True))
+        return replace(state, optima=(early,), here=self._begin_fit(state, state.plain, white=True))
 
     def free_run_errors(self, theta: FloatArray, plain: FloatArray) -> tuple[float, float]:
         """Free-run errors of theta (N,) and of ``plain`` (N,): geometric means over logs and channels.
@@ -789,7 +792,7 @@ class SegmentSolver:
             windows.short, theta = True, None
         if theta is None:
             return replace(state, done=True)
-        points, here = np.concatenate([state.points, theta[None]]), self._begin_fit(theta, state.here.white)
+        points, here = np.concatenate([state.points, theta[None]]), self._begin_fit(state, theta, state.here.white)
         return replace(state, points=points, point=len(state.points), here=here, elsewhere=True)
 
     @property
@@ -880,7 +883,7 @@ class SegmentSolver:
                 return None  # within two sds, on its way to that end
             if left < 6 and energy - left * max(step.gained, 0.0) > worst:
                 return None  # at this pace it does not get there
-            if step.ends(self._plain_enough(view, step.lin.residual)):
+            if step.ends(self._plain_enough(view, here, step.lin.residual)):
                 break
         return None if energy > worst else _End(here.theta, energy, step.hessian)
 
@@ -906,7 +909,7 @@ class SegmentSolver:
             residual, valid = view.residuals(thetas, starts)
         energy = WindowEnergy(view, Noise(best.sd, best.tau), self.prior)
         first, other = (energy(*one) for one in zip(thetas, starts, residual, strict=True))
-        return bool(valid.all() and other - first > 10.0 * state.wider)
+        return bool(valid.all() and other - first > 10.0 * (state.wider if here.white else 1.0))
 
 
 def is_back(theta: FloatArray, begin: FloatArray, optimum: WindowOptimum) -> bool:
