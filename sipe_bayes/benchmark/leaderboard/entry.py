@@ -116,10 +116,6 @@ class Answers:
         plain = {**vars(self), "logs": {name: _plain(answer) for name, answer in self.logs.items()}}
         write_text(answers_path(folder, self.task), to_json(plain) + "\n")
 
-    def complete(self, problem: Problem) -> bool:
-        """Whether every log of the task has its answer."""
-        return set(self.logs) == {case.name for case in problem.cases}
-
 
 def answers_path(folder: Path, task: str) -> Path:
     """Of an entry's answers to a task."""

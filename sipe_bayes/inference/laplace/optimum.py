@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.findings import Finding
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, StrategyState
@@ -95,14 +95,6 @@ def free_noise(windows: Windows) -> IntArray:
 def same_noise(a: Noise, b: Noise) -> bool:
     """Whether two are as good as equal."""
     return bool(np.allclose(a.sd, b.sd, rtol=_SAME_NOISE) and np.allclose(a.tau, b.tau, rtol=3 * _SAME_NOISE))
-
-
-def misfit(windows: Windows, residual: FloatArray) -> float:
-    """Root mean square of residuals (W, L, C), in units of the spread of each channel that has one."""
-    spread = windows.spread
-    moves = spread > 1e-9 * spread.max()
-    size = np.where(moves, spread, np.inf) if moves.any() else np.ones_like(spread)
-    return float(np.sqrt(((residual / size)[windows.observed] ** 2).mean())) or 1e-300
 
 
 def start_noise(windows: Windows) -> FloatArray:

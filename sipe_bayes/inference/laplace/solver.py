@@ -8,14 +8,18 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
 **Phases**, one step of each is a linearisation and the best of a few damped steps (Levenberg, Marquardt):
 
 1. PLAIN: theta alone, the segments begin as measured, white noise of the residuals' present size. On a part of the
-   segments first, then on as many as ``linearised_steps`` allows. Its end is the plain fit, the first answer.
+   segments first, then on as many as ``linearised_steps`` allows. Its end is the plain fit, the first answer. Of steps
+   that gain about the same the shortest is taken: what a log leaves open stays near the model as given.
 2. FIT: theta and the initial states, noise by restricted likelihood before each step; on the same part, then on
    ``whole`` times as many segments. Columns of the initial states are kept while they predict what a step gains. The
    first step holds plain against generalised least squares (``_noise_takes_over``).
 3. COMPARE: the plain fit and the posterior mode each run free along the whole training logs. Where the mode is worse by
-   more than 3 %, coloured noise explains what parameters should. Then the estimate is that of white noise, fitted again
-   from the plain fit. The interval is the sandwich (``likelihood.restricted``), which holds for coloured residuals.
-   Where that is worse than the plain fit, too, ``behind_plain`` says so.
+   more than 3 %, coloured noise explains what parameters should.
+
+**Plain least squares have the last word** where coloured noise explains what parameters should, by the first step of
+FIT or by COMPARE: PLAIN goes on from its end, on ``whole`` times as many segments. The interval is the sandwich
+(``likelihood.restricted``), which holds for coloured residuals. Where velocities are not measured initial states are
+fitted as well. A free-run error above the plain fit's is told by ``behind_plain``.
 
 **Differences** of theta run along the principal axes of the posterior and are a third of its sd along each. So slopes
 are those of the posterior's width, whatever dry friction or a delay does below it.
@@ -24,7 +28,8 @@ are those of the posterior's width, whatever dry friction or a delay does below 
 mass from its joint give a pendulum one period, for example. From four points far from the optimum, plain fits go down:
 on so few segments that all take a twentieth of what the fit took. One that ends elsewhere and fits as well goes on with
 the smallest part. If it still does, and what lies between fits worse, FIT follows it. Then another one is
-looked for from there. All are kept, weighted by their evidence.
+looked for from there. All are kept, weighted by their evidence. Where the fit is poor (residuals larger than ``poor``
+times what samples scatter by) the best of a few draws from the prior are such points, too.
 
 **Impacts** make simulations jump. There beginnings of the segments are fitted first, two control steps and then ever
 more. On the shortest ones plain fits go down from the nominal model and the best of some draws from the prior; the best
@@ -57,7 +62,6 @@ from sipe_bayes.inference.laplace.optimum import (
     WindowOptimum,
     WindowState,
     beyond_known_noise,
-    misfit,
     present_noise,
     same_noise,
     summarised,
@@ -104,7 +108,6 @@ class Here:
     axes: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # (N, N), rows of theta's; empty at first
     residual: FloatArray | None = None  # (K, L, C); None where they are to be simulated
     starts_jacobian: FloatArray | None = None  # (K, L, C, D), kept; None where it is to be taken anew
-    misfit: float = 0.0  # of the first residuals, in units of the channels' spread
     exact: bool = False  # whether the step before gained what was expected, so that its kept columns still hold
     gained: float = np.inf  # nats, by the step before
     enough: float = 0.0  # nats that plain least squares may leave; 0: as their residual tells
@@ -130,11 +133,6 @@ class SolverState(WindowState):
     def behind_noise(self) -> bool:
         """Whether the interval is the sandwich, since coloured noise would have taken over what parameters explain."""
         return self.here.white and (self.wider > 1 or self.behind > 0)
-
-    @property
-    def stage_begins(self) -> bool:
-        """Whether the noise model is still to be held against plain least squares."""
-        return not self.compared and not self.here.white and len(self.plain) > 0
 
 
 class _Trial(NamedTuple):
@@ -255,9 +253,8 @@ class SegmentSolver:
         course = [(Stage.PLAIN, 0, 6), (Stage.PLAIN, 1, 6), (Stage.FIT, 1, 4), (Stage.FIT, 2, 4)]
         course = [(stage, part + whole, steps) for stage, part, steps in course]
         look = 0.0 if state.behind_noise or state.done else 2.0 * (1 + 4 * n)  # at what lies beyond the normal
-        now = next(
-            (k for k, (stage, part, _) in enumerate(course) if (stage, part) == (here.stage, max(here.part, whole))), 3
-        )
+        stands = here.stage, max(here.part, whole)
+        now = next((k for k, (stage, part, _) in enumerate(course) if (stage, part) == stands), 3)
         for k, (stage, part, steps) in enumerate(course[now:] if not state.done else ()):
             columns = n + (d if stage is Stage.FIT else 0) + 2  # trials: mostly one
             new = part == whole or self._share(part - 1) < 1 or stage is not course[max(now + k - 1, 0)][0]
@@ -307,12 +304,6 @@ class SegmentSolver:
         """Whether plain least squares have taken over from coloured noise, and initial states are as measured."""
         return here.white and self.windows.settings.noise == "ar1" and self.windows.rates_measured
 
-    def _as_measured(self, view: Windows) -> Windows:
-        """Segments whose initial states are known as well as smoothed measurements tell them."""
-        view = copy.copy(view)
-        view.start_precision = view.measured_precision
-        return view
-
     def _next_part(self, stage: Stage, part: int, white: bool = False) -> int | None:
         """The next part with more segments; None where there is none."""
         size = self._view(part)[1].observed.size
@@ -331,11 +322,8 @@ class SegmentSolver:
     def screened(self, nominal: FloatArray, draws: int, number: int = 0) -> tuple[FloatArray, FloatArray | None, bool]:
         """The best of the nominal model (N,) and draws from the prior, best first, and the first one's residual.
 
-        And whether the nominal model is valid.
-
-        The nominal model is among them, last at least, if it is valid.
-
-        By plain residuals of the smallest part; each ``number`` has draws of its own.
+        And whether the nominal model is valid: then it is among them, last at least. By plain residuals of the smallest
+        part; each ``number`` has draws of its own.
         """
         view = self._view(0)[1]
         generator = torch.Generator().manual_seed(self.problem.seed + number)
@@ -440,7 +428,6 @@ class SegmentSolver:
         gained, damping = energy - lowest, float(here.damping * _DAMPINGS[best])
         scale, after = self._scaled(view, precision, None), replace(here, iteration=here.iteration + 1)
         after = replace(after, scale=scale, axes=self._axes(view, here.theta, hessian, scale), noise=noise)
-        after = replace(after, misfit=here.misfit or misfit(view, lin.residual))
         if gained > 0:
             after = replace(after, theta=thetas[best], residual=residual, damping=self._damped(damping))
         else:
@@ -450,15 +437,12 @@ class SegmentSolver:
         return _PlainStep(after, lin, hessian, min(energy, lowest), gained, expected, stuck)
 
     def _plain_enough(self, view: Windows, here: Here, residual: FloatArray) -> float:
-        """Nats that plain least squares may leave: more where a residual (K, L, C) follows itself, and counts for less."""
+        """Nats that plain least squares may leave: more where a residual (K, L, C) follows itself."""
         if here.enough:
             return here.enough
-        ratios = []
-        for c, sequence in enumerate(view.sequences):
-            z = residual[:, :, c].ravel()[sequence.index]
-            follows = float(z[1:] @ z[:-1]) / max(float(z @ z), 1e-300)
-            ratios.append((1 + np.clip(follows, 0.0, 0.98)) / (1 - np.clip(follows, 0.0, 0.98)))
-        return float(self.tuning.plain_gain * view.num_theta * np.exp(np.log(ratios).mean()))
+        series = (residual[:, :, c].ravel()[s.index] for c, s in enumerate(view.sequences))
+        follows = np.clip([float(z[1:] @ z[:-1]) / max(float(z @ z), 1e-300) for z in series], 0.0, 0.98)
+        return float(self.tuning.plain_gain * view.num_theta * np.exp(np.log((1 + follows) / (1 - follows)).mean()))
 
     def _scouted(self, state: SolverState, here: Here, energy: float) -> tuple[SolverState, Here]:
         """After a plain fit of the smallest part: from the next starting point, or on from the best end of all."""
@@ -507,47 +491,39 @@ class SegmentSolver:
 
     def _fit(self, state: SolverState) -> SolverState:
         here, (keep, view) = state.here, self._view(state.here.part)
-        view = self._as_measured(view) if here.white else view
+        if here.white:  # initial states are known as well as smoothed measurements tell them
+            view = copy.copy(view)
+            view.start_precision = view.measured_precision
         with self.windows.counting(view):
             lin, fresh, scale = self._linearised(view, here, here.starts[keep])
             if not lin.valid:  # on more segments than before: from the initial states that were measured
                 here = replace(here, starts=self.windows.no_starts(), residual=None)
                 lin, fresh, scale = self._linearised(view, replace(here, starts_jacobian=None), here.starts[keep])
-            if state.stage_begins and self.tuning.compares:
+            if self.tuning.compares and len(state.plain) and not (state.compared or here.white):
                 takes_over, wider = self._noise_takes_over(view, here, lin)
-                here = replace(here, white=takes_over)
-                view = self._as_measured(view) if takes_over else view
-                state = replace(state, compared=True, wider=wider)
+                here, state = replace(here, white=takes_over), replace(state, compared=True, wider=wider)
                 if self._takes_over(here):
                     return replace(state, here=self._begin_fit(state, state.plain, white=True))
-            moments = view.moments(lin, white=here.white)
-            if self._takes_over(here):
-                here = replace(here, noise=present_noise(view, lin.residual))
-                return self._ended(state, here, lin, moments, keep, view, True)
-            noise = here.noise
-            if here.iteration == 0 or (here.stage is Stage.FIT and not here.noise.tau.any()):
+            moments, noise = view.moments(lin, white=here.white), here.noise
+            if here.iteration == 0 or not noise.tau.any():
                 noise = present_noise(view, lin.residual)
-            noise = updated_noise(view, moments, noise, here.theta, here.starts[keep], self.prior, not here.white)
-            tolerance = self.tuning.tolerance * max(view.num_theta, 1) * (state.wider if here.white else 1.0)
-            trial, lengths = self._tried(view, here, lin, moments, noise, here.starts[keep], tolerance)
-        after = replace(
-            here,
-            iteration=here.iteration + 1,
-            noise=noise,
-            exact=here.exact if trial.expected < tolerance else abs(trial.gained / trial.expected - 1) < 0.05,
-            scale=scale if lengths is None else lengths[0],
-            axes=here.axes if lengths is None else lengths[1],
-            misfit=here.misfit or misfit(view, lin.residual),
-            gained=trial.gained,
-        )
+            if not (over := self._takes_over(here)):
+                noise = updated_noise(view, moments, noise, here.theta, here.starts[keep], self.prior, not here.white)
+                tolerance = self.tuning.tolerance * max(view.num_theta, 1) * (state.wider if here.white else 1.0)
+                trial, lengths = self._tried(view, here, lin, moments, noise, here.starts[keep], tolerance)
+        if over:
+            return self._ended(state, replace(here, noise=noise), lin, moments, keep, view, True)
+        scale, axes = (scale, here.axes) if lengths is None else lengths
+        exact = here.exact if trial.expected < tolerance else abs(trial.gained / trial.expected - 1) < 0.05
+        after = replace(here, iteration=here.iteration + 1, noise=noise, gained=trial.gained)
+        after = replace(after, exact=exact, scale=scale, axes=axes)
         slow = trial.gained < tolerance and (here.damping <= 1.0 or here.gained < tolerance)
         small = trial.expected < tolerance or slow
         settled = small and same_noise(noise, here.noise)
         stuck = trial.gained <= 0 and here.damping >= 1e3
         elsewhere = bool(np.isfinite(state.ends).any()) and after.iteration >= _SCOUTED_STEPS
         last = elsewhere or after.iteration >= self.tuning.most_steps or self._leaves_no_room()
-        near = settled and here.exact
-        if (settled or stuck) and not (fresh or near or last):
+        if (settled or stuck) and not (fresh or last or (settled and here.exact)):
             return replace(state, here=replace(after, starts_jacobian=None))
         if settled or stuck or last:
             part = None if last else self._next_part(Stage.FIT, here.part)
@@ -849,16 +825,10 @@ class SegmentSolver:
         return out
 
     def _pick_drawn(self, state: SolverState) -> list[FloatArray]:
-        """The best of draws from the prior that are not near the last optimum."""
-        view, options = self._view(0)[1], self.problem.options
-        generator = torch.Generator().manual_seed(self.problem.seed + len(state.points))
-        drawn = self.problem.prior.sample((max(options.candidates, 1),), generator=generator).numpy()
-        with self.windows.counting(view):
-            residual, valid = view.residuals(drawn, view.no_starts(len(drawn)))
-        loss = np.array([self._profile(view, r) if ok else np.inf for r, ok in zip(residual, valid, strict=True)])
-        away = np.linalg.norm(drawn - state.optima[-1].theta, axis=1)
-        loss = np.where(away >= np.median(away), loss, np.inf)  # near ones end at the same optimum
-        return list(drawn[np.argsort(loss, kind="stable")[: min(options.restarts - 1, int(np.isfinite(loss).sum()))]])
+        """The best of draws from the prior."""
+        theta, options = state.optima[-1].theta, self.problem.options
+        best = self.screened(theta, max(options.candidates, 1), len(state.points))[0]
+        return [one for one in best if (one != theta).any()][: options.restarts - 1]
 
     def _take_few(self, thetas: int) -> Windows:
         """So few segments that simulations of ``thetas`` take a twentieth of what the fit took, mostly less; or two."""
@@ -932,8 +902,8 @@ def best_step(
 ) -> tuple[int, FloatArray, float]:
     """Of ever shorter steps to thetas (M, N) and starts (M, W, D) the best one: its number, residual and energy.
 
-    It is the shortest that gains all but ``slack`` nats of what the best gains, and half of that, from an energy ``now``:
-    where a log tells little, parameters stay near the model as given.
+    From an energy ``now`` it is the shortest that gains half of what the best gains, and all but ``slack`` nats: where
+    a log tells little, parameters stay near the model as given.
     """
     residuals, valid = view.residuals(thetas, starts)
     each = zip(thetas, starts, residuals, valid, strict=True)
