@@ -169,7 +169,6 @@ def test_wheels_that_slip_make_simulations_jump_and_wheels_that_roll_do_not() ->
     assert smooth == Contacts(touch=True, change=False, rough=False)
 
 
-@pytest.mark.xfail(reason="tyres slip: two searches end apart, which starts_contradict tells", strict=True)
 def test_a_rovers_motors_come_back() -> None:
     simulator, log = rover()
     estimator = Laplace(simulator, restarts=1, candidates=0, seed=0)

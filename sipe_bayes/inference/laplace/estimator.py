@@ -203,7 +203,8 @@ class Laplace(Estimator[LaplaceState]):
         if isinstance(search, SolverState) and search.behind_noise:
             return replace(ended, search=search)  # its interval is no likelihood's
         kept = distinct(search.optima)
-        if isinstance(search, SolverState) and search.here.exact and np.diag(kept[0].covariance).max() < 0.02**2:
+        exact = isinstance(search, SolverState) and search.here.exact and windows.has_parts  # a function costs little
+        if exact and np.diag(kept[0].covariance).max() < 0.02**2:
             return replace(ended, search=search)  # narrow, and as the linearisation foretold at its own width
         look = look_beyond(self.problem, windows, kept)
         ended = replace(ended, search=search, draws=look.draws, given=look.given, unjudged=not look.judged)

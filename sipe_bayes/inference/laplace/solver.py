@@ -623,7 +623,7 @@ class SegmentSolver:
             thetas.append(theta)
             changes.append(solved.blocks(move))
         stacked, all_starts = np.stack(thetas), starts + np.stack(changes)
-        best, residual, lowest = best_step(view, stacked, all_starts, energy, now, tolerance)
+        best, residual, lowest = best_step(view, stacked, all_starts, energy, now, 0.1 * tolerance)
         damping = float(here.damping * _DAMPINGS[best])
         return _Trial(stacked[best], all_starts[best], residual, now - lowest, expected, damping), scale
 
@@ -853,7 +853,7 @@ class SegmentSolver:
                 return None  # within two sds, on its way to that end
             if left < 6 and energy - left * max(step.gained, 0.0) > worst:
                 return None  # at this pace it does not get there
-            if step.ends(self._plain_enough(view, here, step.lin.residual)):
+            if step.ends(self._plain_enough(view, here, step.lin.residual), foretold=False):
                 break
         return None if energy > worst else _End(here.theta, energy, step.hessian)
 
