@@ -242,8 +242,8 @@ class Code(Enum):
         "{plain:.2g} % with plain least squares"
     )
     LEAST_SQUARES = note(
-        "Plain least squares predict better than a fit with correlated noise, or differ from it by more than such noise "
-        "allows (Hausman test). Theirs are the estimates; the intervals allow for the correlation of the residuals"
+        "Plain least squares predict better than a fit with correlated noise, or differ from it by more than such "
+        "noise allows (Hausman test). Theirs are the estimates; the intervals allow for correlated residuals"
     )
     NOISE_DRIFTS = caution(
         "noise of {channels} has a correlation time as long as the logs ({tau:.2g} s): mostly changes from sample to "

@@ -122,7 +122,7 @@ def test_discovered_configuration_finds_the_same_optimum(case: tuple[Path, Disco
     assert data["structure"]["probability"] == pytest.approx(found.kept[0].probability, rel=0.01)
     again = run(Path(found.out) / "discovered.toml", out=config.parent / "again", num_threads=1)
     best = json.loads((Path(found.out) / "structures.json").read_text())["best"]
-    assert {p.name: p.mode for p in again.parameters} == pytest.approx(best, rel=1e-3)
+    assert {p.name: p.mode for p in again.parameters} == pytest.approx(best, rel=1e-2)
 
 
 @pytest.mark.parametrize(("probability", "told"), [(0.62, True), (0.95, False)])
@@ -293,16 +293,16 @@ def test_wrong_restriction_is_one_line(table: str, words: list[str], tmp_path: P
 
 def test_a_budget_that_ends_too_soon_is_said_and_what_to_give(tmp_path: Path) -> None:
     """Before a piece was fitted to the end: neither that nothing is lacking nor that the values hold."""
-    config = write_lacking(tmp_path, structure='[structure]\nonly = ["dry_friction"]\nbudget = 60\n')
+    config = write_lacking(tmp_path, structure='[structure]\nonly = ["dry_friction"]\nbudget = 40\n')
     spent = run_discovery(config, tmp_path / "out", num_threads=1)
     assert not spent.settled
-    assert spent.rollouts <= 60
+    assert spent.rollouts <= 40
     assert [item.code for item in spent.findings] == [Code.STRUCTURES_CUT_SHORT]
     texts = [verdict.text for verdict in discovery_verdicts(spent)]
     before = "was spent before all pieces that promise something were fitted"
-    open_still = f"{before} (left open: dry friction at hinge): give --budget 120"
+    open_still = f"{before} (left open: dry friction at hinge): give --budget 80"
     assert any(
-        text.startswith(f"No value may be trusted yet: the budget of 60 rollouts {open_still}") for text in texts
+        text.startswith(f"No value may be trusted yet: the budget of 40 rollouts {open_still}") for text in texts
     )
     assert "no piece was fitted to its end" in texts[0]
     assert json.loads((tmp_path / "out" / "structures.json").read_text())["settled"] is False

@@ -16,10 +16,10 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
 3. COMPARE: the plain fit and the posterior mode each run free along the whole training logs. Where the mode is worse by
    more than 3 %, coloured noise explains what parameters should.
 
-**Plain least squares have the last word** where coloured noise explains what parameters should, by the first step of
-FIT or by COMPARE: PLAIN goes on from its end, on ``whole`` times as many segments. The interval is the sandwich
-(``likelihood.restricted``), which holds for coloured residuals. Where velocities are not measured initial states are
-fitted as well. A free-run error above the plain fit's is told by ``behind_plain``.
+**Plain least squares have the last word** where coloured noise explains what parameters should. By the first step of
+FIT: PLAIN goes on from its end, on ``whole`` times as many segments; where velocities are not measured, and by COMPARE,
+initial states are fitted as well. The interval is the sandwich (``likelihood.restricted``), which holds for coloured
+residuals. A free-run error above the plain fit's is told by ``behind_plain``.
 
 **Differences** of theta run along the principal axes of the posterior and are a third of its sd along each. So slopes
 are those of the posterior's width, whatever dry friction or a delay does below it.
@@ -218,7 +218,7 @@ class SegmentSolver:
         assert isinstance(state, SolverState)
         if len(state.points) >= self.tuning.most_points or self._leaves_no_room():
             return None
-        here = self._begin_fit(state, theta, state.here.white)
+        here = self._begin_fit(state, theta, state.here.enough > 0)
         if starts is not None and here.stage is Stage.FIT:
             here = replace(here, starts=starts, part=self._last(Stage.FIT))
         points = np.concatenate([state.points, theta[None]])
@@ -299,10 +299,6 @@ class SegmentSolver:
     def _last(self, stage: Stage, white: bool = False) -> int:
         """The largest part that a stage simulates; ``white``: where plain least squares have the last word."""
         return len(self._beginnings) + (1 if stage is Stage.PLAIN and not white else 2)
-
-    def _takes_over(self, here: Here) -> bool:
-        """Whether plain least squares have taken over from coloured noise, and initial states are as measured."""
-        return here.white and self.windows.settings.noise == "ar1" and self.windows.rates_measured
 
     def _next_part(self, stage: Stage, part: int, white: bool = False) -> int | None:
         """The next part with more segments; None where there is none."""
@@ -395,7 +391,7 @@ class SegmentSolver:
             step = self._plain_step(view, here)
         if not step.lin.valid:  # diverges on what the part before did not hold
             return replace(state, here=replace(here, stage=Stage.FIT, residual=None, starts_jacobian=None))
-        after, more = step.after, self._next_part(Stage.PLAIN, here.part, self._takes_over(here))
+        after, more = step.after, self._next_part(Stage.PLAIN, here.part, here.enough > 0)
         enough = self._plain_enough(view, here, step.lin.residual) * (10.0 if here.part == 0 and more else 1.0)
         if not step.ends(enough, foretold=not here.enough) and after.iteration < self.tuning.most_steps:
             return replace(state, here=after)
@@ -502,16 +498,16 @@ class SegmentSolver:
             if self.tuning.compares and len(state.plain) and not (state.compared or here.white):
                 takes_over, wider = self._noise_takes_over(view, here, lin)
                 here, state = replace(here, white=takes_over), replace(state, compared=True, wider=wider)
-                if self._takes_over(here):
-                    return replace(state, here=self._begin_fit(state, state.plain, white=True))
+                if takes_over and self.windows.rates_measured:
+                    return replace(state, here=self._begin_fit(state, state.plain, plain=True))
             moments, noise = view.moments(lin, white=here.white), here.noise
             if here.iteration == 0 or not noise.tau.any():
                 noise = present_noise(view, lin.residual)
-            if not (over := self._takes_over(here)):
+            if not here.enough:
                 noise = updated_noise(view, moments, noise, here.theta, here.starts[keep], self.prior, not here.white)
                 tolerance = self.tuning.tolerance * max(view.num_theta, 1) * (state.wider if here.white else 1.0)
                 trial, lengths = self._tried(view, here, lin, moments, noise, here.starts[keep], tolerance)
-        if over:
+        if here.enough:
             return self._ended(state, replace(here, noise=noise), lin, moments, keep, view, True)
         scale, axes = (scale, here.axes) if lengths is None else lengths
         exact = here.exact if trial.expected < tolerance else abs(trial.gained / trial.expected - 1) < 0.05
@@ -545,13 +541,13 @@ class SegmentSolver:
         after = replace(after, theta=trial.theta, starts=starts, residual=trial.residual)
         return replace(state, here=replace(after, damping=self._damped(trial.damping)))
 
-    def _begin_fit(self, state: SolverState, theta: FloatArray, white: bool) -> Here:
-        """From theta (N,) where plain least squares have been: on by them on all segments, or by FIT on the first."""
-        here = replace(self._begin(theta), white=white)
-        if self._takes_over(here):
-            enough = self.tuning.tolerance * len(theta) * state.wider
-            return replace(here, part=self._last(Stage.PLAIN, white=True), enough=enough)
-        return replace(here, stage=Stage.FIT)
+    def _begin_fit(self, state: SolverState, theta: FloatArray, plain: bool = False) -> Here:
+        """From theta (N,) by FIT on the first part; ``plain``: by least squares, which have the last word, on all."""
+        here = replace(self._begin(theta), white=state.here.white or plain)
+        if not plain:
+            return replace(here, stage=Stage.FIT)
+        enough = self.tuning.tolerance * len(theta) * state.wider
+        return replace(here, part=self._last(Stage.PLAIN, white=True), enough=enough)
 
     def _noise_takes_over(self, view: Windows, here: Here, lin: Linearisation) -> tuple[bool, float]:
         """Whether coloured noise would move theta farther from plain least squares than coloured noise itself could.
@@ -718,7 +714,7 @@ class SegmentSolver:
             return self._finish(state)
         early = replace(best, finding=finding(Code.SEARCH_CUT_SHORT), early=True)
         self.problem.tell("white noise, from the plain fit", self.windows.rollouts)
-        return replace(state, optima=(early,), here=self._begin_fit(state, state.plain, white=True))
+        return replace(state, optima=(early,), here=replace(self._begin_fit(state, state.plain), white=True))
 
     def free_run_errors(self, theta: FloatArray, plain: FloatArray) -> tuple[float, float]:
         """Free-run errors of theta (N,) and of ``plain`` (N,): geometric means over logs and channels.
@@ -768,7 +764,7 @@ class SegmentSolver:
             windows.short, theta = True, None
         if theta is None:
             return replace(state, done=True)
-        points, here = np.concatenate([state.points, theta[None]]), self._begin_fit(state, theta, state.here.white)
+        points, here = np.concatenate([state.points, theta[None]]), self._begin_fit(state, theta, state.here.enough > 0)
         return replace(state, points=points, point=len(state.points), here=here, elsewhere=True)
 
     @property

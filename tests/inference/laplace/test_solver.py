@@ -120,14 +120,13 @@ def test_the_plain_fit_is_told_first() -> None:
 def test_one_start_means_one() -> None:
     """Without restarts a fit stays what it is; with them plain fits go down from other points."""
     log = recorded(0, friction=0.9)
-    counts, rollouts = [], []
+    rollouts = []
     for restarts in (1, 3):
         method = Laplace(servo(), likelihood=Segments(4.0), restarts=restarts)
         method.fit(log)
         assert method.state is not None
-        counts.append(len(method.state.search.points))
+        assert restarts > 1 or len(method.state.search.points) == 1
         rollouts.append(method.rollouts)
-    assert counts[0] == 1
     assert rollouts[1] > rollouts[0]
 
 
