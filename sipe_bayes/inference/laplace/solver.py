@@ -546,7 +546,7 @@ class SegmentSolver:
         here = replace(self._begin(theta), white=state.here.white or plain)
         if not plain:
             return replace(here, stage=Stage.FIT)
-        enough = self.tuning.tolerance * len(theta) * state.wider
+        enough = 3.0 * self.tuning.tolerance * len(theta) * state.wider  # half an sd of the sandwich at most
         return replace(here, part=self._last(Stage.PLAIN, white=True), enough=enough)
 
     def _noise_takes_over(self, view: Windows, here: Here, lin: Linearisation) -> tuple[bool, float]:
