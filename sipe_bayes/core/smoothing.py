@@ -29,9 +29,7 @@ def smoothed(series: FloatArray, dt: float, derivative: int = 0, wider: int = 1)
         return np.gradient(series, dt, axis=0) if derivative else series
     weights, half, inner = _weights(span, derivative), span // 2, len(series) - span + 1
     middle = sum(weight * series[k : k + inner] for k, weight in enumerate(weights[half]))
-    begin, end = (
-        np.tensordot(w, s, 1) for w, s in ((weights[:half], series[:span]), (weights[-half:], series[-span:]))
-    )
+    begin, end = np.tensordot(weights[:half], series[:span], 1), np.tensordot(weights[-half:], series[-span:], 1)
     return np.concatenate([begin, middle, end]) / dt**derivative
 
 

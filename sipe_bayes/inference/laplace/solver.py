@@ -24,12 +24,11 @@ residuals. A free-run error above the plain fit's is told by ``behind_plain``.
 **Differences** of theta run along the principal axes of the posterior and are a third of its sd along each. So slopes
 are those of the posterior's width, whatever dry friction or a delay does below it.
 
-**Other optima** that fit as well are looked for after the fit, unless ``restarts`` is one. Two distances of a centre of
-mass from its joint give a pendulum one period, for example. From four points far from the optimum, plain fits go down:
-on so few segments that all take a twentieth of what the fit took. One that ends elsewhere and fits as well goes on with
-the smallest part. If it still does, and what lies between fits worse, FIT follows it. Then another one is
-looked for from there. All are kept, weighted by their evidence. Where the fit is poor (residuals larger than ``poor``
-times what samples scatter by) the best of a few draws from the prior are such points, too.
+**Other optima** that fit as well are looked for after the fit, unless ``restarts`` is one: two distances of a centre of
+mass from its joint give a pendulum one period. Plain fits go down from four points far from the optimum, and from the
+best draws of the prior where residuals are larger than ``poor`` times the samples' scatter; first on few segments, a
+twentieth of the cost so far, then on the smallest part. If one ends elsewhere, fits as well, and what lies between fits
+worse, FIT follows it. All optima are kept, weighted by their evidence.
 
 **Impacts** make simulations jump. There beginnings of the segments are fitted first, two control steps and then ever
 more. On the shortest ones plain fits go down from the nominal model and the best of some draws from the prior; the best
@@ -821,9 +820,12 @@ class SegmentSolver:
         return out
 
     def _pick_drawn(self, state: SolverState) -> list[FloatArray]:
-        """The best of draws from the prior."""
+        """The best of draws from the prior; none where they all diverge."""
         theta, options = state.optima[-1].theta, self.problem.options
-        best = self.screened(theta, max(options.candidates, 1), len(state.points))[0]
+        try:
+            best = self.screened(theta, max(options.candidates, 1), len(state.points))[0]
+        except ValueError:
+            return []
         return [one for one in best if (one != theta).any()][: options.restarts - 1]
 
     def _take_few(self, thetas: int) -> Windows:
