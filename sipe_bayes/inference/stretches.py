@@ -24,8 +24,7 @@ from sipe_bayes.inference.importance import Target
 class StretchTuning:
     """How far a posterior is looked at beyond its normal, and what counts."""
 
-    near: ClassVar[float] = 2.0  # sds, the nearer points
-    far: ClassVar[float] = 8.0  # sds, the further ones; where the density holds on, twice as far again
+    far: ClassVar[float] = 8.0  # sds, the first points; where the density holds on, twice as far again
     slack: ClassVar[float] = 0.5  # nats, by which falls of the log posterior may differ for rounding's sake
     least_fall: ClassVar[float] = 0.6  # a fall, over that of the normal, which is none too small
     unseen: ClassVar[float] = 0.01  # of the normal's mass, which a stretch has to have to count
@@ -55,9 +54,9 @@ class Stretch:
     parameter: int | None
 
 
-def look_size(size: int, near: bool = True) -> int:
+def look_size(size: int) -> int:
     """Points that ``stretches`` looks at in ``size`` dimensions where there is none."""
-    return 1 + (8 if near else 4) * size
+    return 1 + 4 * size
 
 
 def stretches(
@@ -66,12 +65,8 @@ def stretches(
     mean: FloatArray,
     covariance: FloatArray,
     tuning: StretchTuning,
-    near: bool = True,
 ) -> list[Stretch]:
-    """Those beyond N(mean, covariance) of a log density with its optimum in the cube at theta (N,); most mass first.
-
-    near: whether the nearer points are looked at too.
-    """
+    """Those beyond N(mean, covariance) of a log density with its optimum in the cube at theta (N,); most mass first."""
     start = mean if ((mean >= 0) & (mean <= 1)).all() else theta
     level = float(target(start[None])[0])
     if not np.isfinite(level):
@@ -85,7 +80,7 @@ def stretches(
     most = room.min(1)
     by_way: dict[int, Stretch] = {}
     centre = start - mean
-    open_ways, length = np.flatnonzero(most > 0.5 * tuning.near), tuning.near if near else tuning.far
+    open_ways, length = np.flatnonzero(most > 1.0), tuning.far  # nearer bounds leave no room for a stretch
     while len(open_ways):
         reached = np.minimum(length, most[open_ways])
         points = np.clip(start + reached[:, None] * ways[open_ways], 0.0, 1.0)
@@ -97,10 +92,8 @@ def stretches(
             way = int(open_ways[k])
             parameter = way % (len(ways) // 2) if way % (len(ways) // 2) < n else None
             by_way[way] = Stretch(start, points[k], float(falls[k]), float(reached[k]), parameter)
-        if length > tuning.near:  # the far points are looked at along all ways
-            open_ways = open_ways[small]
-        open_ways = open_ways[most[open_ways] > length]
-        length = tuning.far if length == tuning.near else 2 * length
+        open_ways = open_ways[small & (most[open_ways] > length)]
+        length = 2 * length
     ordered = sorted(by_way.values(), key=lambda one: one.fall - np.log(one.distance))
     return ordered[: tuning.most]
 

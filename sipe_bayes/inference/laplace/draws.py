@@ -60,7 +60,7 @@ def look_beyond(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum
     # elsewhere the slope of starts at an optimum may be steep; from half of the range on it is none
     open_sd = max(np.sqrt(np.diag(one.covariance)).max() for one in shared) > 0.5
     probes = len(shared) * importance.probe_size(n) if not windows.num_start or open_sd else 0
-    look = cost * look_size(n, near=False) if single else 0
+    look = cost * look_size(n) if single else 0
     if not windows.has_room(windows.num_start + probes + look):
         return Look(judged=False)
     assert isinstance(kept[0], WindowOptimum)
@@ -74,7 +74,7 @@ def look_beyond(problem: SearchProblem, windows: Windows, kept: Sequence[Optimum
     if single:
         best = shared[0]
         try:
-            beyond = stretches(target, best.theta, best.mean, best.covariance, problem.options.tuning.stretches, False)
+            beyond = stretches(target, best.theta, best.mean, best.covariance, problem.options.tuning.stretches)
         except BudgetExhausted:
             windows.short = True
             return Look(judged=False)

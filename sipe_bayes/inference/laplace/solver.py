@@ -131,7 +131,7 @@ class SolverState(WindowState):
     @property
     def behind_noise(self) -> bool:
         """Whether the interval is the sandwich, since coloured noise would have taken over what parameters explain."""
-        return self.here.white and (self.wider > 1 or self.behind > 0)
+        return self.here.white and (self.compared or self.behind > 0)
 
 
 class _Trial(NamedTuple):
@@ -494,7 +494,8 @@ class SegmentSolver:
             if not lin.valid:  # on more segments than before: from the initial states that were measured
                 here = replace(here, starts=self.windows.no_starts(), residual=None)
                 lin, fresh, scale = self._linearised(view, replace(here, starts_jacobian=None), here.starts[keep])
-            if self.tuning.compares and len(state.plain) and not (state.compared or here.white):
+            compares = self.tuning.compares and len(state.plain) and not (state.compared or here.white)
+            if compares and not self._starts_explain(view, here, lin):
                 takes_over, wider = self._noise_takes_over(view, here, lin)
                 here, state = replace(here, white=takes_over), replace(state, compared=True, wider=wider)
                 if takes_over and self.windows.rates_measured:
@@ -547,6 +548,16 @@ class SegmentSolver:
             return replace(here, stage=Stage.FIT)
         enough = 3.0 * self.tuning.tolerance * len(theta) * state.wider  # half an sd of the sandwich at most
         return replace(here, part=self._last(Stage.PLAIN, white=True), enough=enough)
+
+    def _starts_explain(self, view: Windows, here: Here, lin: Linearisation) -> bool:
+        """Whether initial states explain nine tenths of the squares that plain least squares leave; then they come first.
+
+        Residuals that a smoothed velocity leaves are lines in time, which coloured noise would explain as well.
+        """
+        plain, moments = present_noise(view, lin.residual), view.moments(lin, white=True)
+        starts = here.starts[self._view(here.part)[0]]
+        left = updated_noise(view, moments, plain, here.theta, starts, self.prior, coloured=False)
+        return bool(2.0 * np.log(left.sd / plain.sd).mean() < np.log(0.1))
 
     def _noise_takes_over(self, view: Windows, here: Here, lin: Linearisation) -> tuple[bool, float]:
         """Whether coloured noise would move theta farther from plain least squares than coloured noise itself could.

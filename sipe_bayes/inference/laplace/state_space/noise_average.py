@@ -57,15 +57,25 @@ def averaged(problem: SearchProblem, chain: Chain, fit: ChainFit) -> FloatArray:
     axes, rng = _axes(of_noise, logs, average), np.random.default_rng([problem.seed, 2])
     here, solved = at(logs)
     beside, means, covariances = normal(solved), [], []
-    for draw in range(average.draws):
+    for draw in range(1, average.draws + 1):
         proposed = logs + average.step * rng.standard_normal() * axes[draw % len(axes)]
         value, solved = at(proposed)
         if np.log(rng.random()) < value - here:
             logs, here, beside = proposed, value, normal(solved)
         means.append(beside[0])
         covariances.append(beside[1])
+        if draw % average.round == 0:
+            halves = (slice(draw // 2), slice(draw // 2, None))
+            sds = [np.log(np.diag(_spread(means[half], covariances[half]))) / 2 for half in halves]
+            if np.abs(sds[1] - sds[0]).max() < average.alike:
+                break
+    return _spread(means, covariances)
+
+
+def _spread(means: list[FloatArray], covariances: list[FloatArray]) -> FloatArray:
+    """Covariance (N, N) of a mixture of normals in equal parts."""
     spread = np.array(means) - np.mean(means, axis=0)
-    return np.mean(covariances, axis=0) + np.asarray(spread.T @ spread / len(spread))
+    return np.asarray(np.mean(covariances, axis=0) + spread.T @ spread / len(spread))
 
 
 def _axes(of_noise: NoisePosterior, logs: FloatArray, tuning: AverageTuning) -> FloatArray:

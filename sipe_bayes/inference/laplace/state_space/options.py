@@ -22,7 +22,9 @@ class NoiseTuning:
 class AverageTuning:
     """How theta's normal is averaged over the noise; see ``noise_average``."""
 
-    draws: ClassVar[int] = 800  # Metropolis steps, along one axis of the noise each: an eliminated chain
+    draws: ClassVar[int] = 800  # Metropolis steps at most, along one axis of the noise each: an eliminated chain
+    round: ClassVar[int] = 200  # of them, after which it ends where both halves agree
+    alike: ClassVar[float] = 0.02  # by which the logarithms of their sds may differ
     step: ClassVar[float] = 2.4  # length of a step (sds of the normal)
     least_curvature: ClassVar[float] = 0.5  # of an axis, which bounds that sd: process noise may be open below
     difference: ClassVar[float] = 0.2  # of the logarithms, for the curvature
@@ -48,6 +50,7 @@ class SmoothingTuning:
     steps: ClassVar[int] = 2  # steps between estimates of the noise
     most_estimates: ClassVar[int] = 10  # estimates of the noise
     settled: ClassVar[float] = 1.0  # gain below which a new noise does not matter (nats)
+    blind: ClassVar[float] = 1.0  # damping above which short differences tell nothing of steps: wide ones take over
     most_filters: ClassVar[int] = 3  # estimates of the noise after which the filter runs
     dropped: ClassVar[float] = 0.5  # drop of the process noise after which it does (mean logarithm)
     filter_steps: ClassVar[int] = 4  # steps from the filter's states
@@ -60,7 +63,7 @@ class WideTuning:
     tolerance: ClassVar[float] = 0.5  # nats that a step must promise; less does not show in an interval (nats)
     alike: ClassVar[float] = 0.3  # how far the mean, and logs of the sds, differ of normals that are alike (sd)
     steps: ClassVar[int] = 3  # steps between estimates of the noise
-    most_estimates: ClassVar[int] = 10  # estimates of the noise
+    most_estimates: ClassVar[int] = 20  # estimates of the noise
     last_estimates: ClassVar[int] = 4  # the same where the search was likeliest, if it ended elsewhere
     settled: ClassVar[float] = 2.0  # gain below which a new noise does not matter (nats)
     settled_each: ClassVar[float] = 0.01  # the same where more: contact is rough (nats of a measurement)

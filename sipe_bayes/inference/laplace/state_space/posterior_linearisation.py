@@ -74,17 +74,10 @@ class WideSearch(ChainSearch[S]):
         return linearise_by(self.chain, here.theta, here.states, here.theta_step, here.state_step)
 
     def onward(self, state: S) -> S:
-        """At the next starting point; at the end where the fit from this one is good.
-
-        It is where the noise has settled and is no larger than samples scatter by, no jump stands out, and process
-        noise explains little.
-        """
-        best, chain = state.recorded, self.chain
-        if best is None or not best.settled or best.outliers.any():
-            return state.next_point(self._begin)
-        little = best.absorbed < self.tuning.absorbed * chain.observed.sum()
-        good = little and excess(chain, best.sd).max() < THRESHOLDS.noise_excess
-        return replace(state, done=True) if good else state.next_point(self._begin)
+        """At the next starting point where the fit is poor: unsettled, or with noise far above the samples' scatter."""
+        best = state.recorded
+        poor = best is None or not best.settled or excess(self.chain, best.sd).max() > THRESHOLDS.noise_excess
+        return state.next_point(self._begin) if poor else replace(state, done=True)
 
     def wide_smooth(self, state: S, linear: ChainLinearisation) -> S:
         """A step of theta and all states."""

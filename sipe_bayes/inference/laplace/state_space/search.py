@@ -192,6 +192,8 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         """A step of theta and all states; where none gains anything, an estimate of the noise at once."""
         if state.here.is_wide:
             return self.wide_smooth(state, linear)
+        if state.here.damping > self.tuning.smoothing.blind:
+            return self._widened(state, blind=True)
         tuning, here = self.tuning.smoothing, replace(state.here, iteration=state.here.iteration + 1)
         here = replace(here, steps=here.steps + 1)
         prior, tolerance = self.problem.quadratic_prior, tuning.tolerance
@@ -301,14 +303,15 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         noise = replace(here.noise, outliers=proposed)
         return state.at(replace(again, noise=noise, proposals=here.proposals + 1))
 
-    def _widened(self, state: StateSpaceState) -> StateSpaceState:
-        """From this starting point's optimum on with wide differences; or the next one where it has none."""
-        optimum = state.recorded
-        if optimum is None:
+    def _widened(self, state: StateSpaceState, blind: bool = False) -> StateSpaceState:
+        """On with wide differences from this starting point's optimum, or from where short ones are ``blind``."""
+        here, optimum = state.here, state.recorded
+        if optimum is not None:
+            here = replace(here, theta=optimum.theta, states=optimum.states, noise=optimum.noise)
+        elif not blind:
             return state.next_point(self._begin)
-        here = replace(state.here, phase=Phase.WIDEN, theta=optimum.theta, states=optimum.states, noise=optimum.noise)
-        damping = self.tuning.damping.first
-        return state.at(replace(here, damping=damping, estimates=0, steps=0, estimate_theta=optimum.theta))
+        here = replace(here, phase=Phase.WIDEN, damping=self.tuning.damping.first, estimate_theta=here.theta)
+        return state.at(replace(here, estimates=0, steps=0))
 
     def _widen(self, state: StateSpaceState, linear: ChainLinearisation) -> StateSpaceState:
         """The lengths of wide differences; then whether these say anything else than short ones did."""
