@@ -81,6 +81,8 @@ _DIFFERENCE = 0.3  # conditional posterior sds that a finite difference is long
 _THROUGH_IMPACTS = 100  # draws from the prior, of which the best are followed where simulations jump
 _SCOUTED_STEPS = 16  # after which the next of them is followed: most fits that settle do so by then
 _SCOUTS = 4  # of them that are followed on the shortest beginnings
+_CORRECTIONS = 6  # further steps at most by a linearisation of which a step gains too little
+_EXPLAINED = math.log(0.1)  # share of the squares that initial states leave where they explain most of them
 _WORSE = 1.03  # free-run error over the plain fit's from which white noise takes over
 
 
@@ -147,6 +149,15 @@ class _Trial(NamedTuple):
     gained: float
     expected: float
     damping: float
+
+
+class _Point(NamedTuple):
+    """Where a step led: theta (N,), starts (K, D), the residual (K, L, C) there and the energy."""
+
+    theta: FloatArray
+    starts: FloatArray
+    residual: FloatArray
+    energy: float
 
 
 class _PlainStep(NamedTuple):
@@ -419,17 +430,17 @@ class SegmentSolver:
             return self._profile(view, residual) + self.prior.energy(theta)
 
         enough = self._plain_enough(view, here, lin.residual)
-        best, residual, lowest = best_step(view, thetas, view.no_starts(len(thetas)), energy_of, energy, enough)
-        gained, damping = energy - lowest, float(here.damping * _DAMPINGS[best])
+        best, residuals, values = best_step(view, thetas, view.no_starts(len(thetas)), energy_of, energy, enough)
+        gained, damping = energy - float(values[best]), float(here.damping * _DAMPINGS[best])
         scale, after = self._scaled(view, precision, None), replace(here, iteration=here.iteration + 1)
         after = replace(after, scale=scale, axes=self._axes(view, here.theta, hessian, scale), noise=noise)
         if gained > 0:
-            after = replace(after, theta=thetas[best], residual=residual, damping=self._damped(damping))
+            after = replace(after, theta=thetas[best], residual=residuals[best], damping=self._damped(damping))
         else:
             after = replace(after, residual=lin.residual, damping=self._damped(damping * _DAMPINGS[-1]))
         move = thetas[best] - here.theta
         expected, stuck = float(pull @ move - 0.5 * move @ hessian @ move), gained <= 0 and here.damping >= 1.0
-        return _PlainStep(after, lin, hessian, min(energy, lowest), gained, expected, stuck)
+        return _PlainStep(after, lin, hessian, min(energy, float(values[best])), gained, expected, stuck)
 
     def _plain_enough(self, view: Windows, here: Here, residual: FloatArray) -> float:
         """Nats that plain least squares may leave: more where a residual (K, L, C) follows itself."""
@@ -550,14 +561,14 @@ class SegmentSolver:
         return replace(here, part=self._last(Stage.PLAIN, white=True), enough=enough)
 
     def _starts_explain(self, view: Windows, here: Here, lin: Linearisation) -> bool:
-        """Whether initial states explain nine tenths of the squares that plain least squares leave; then they come first.
+        """Whether initial states explain nine tenths of the squares that least squares leave: they come first then.
 
         Residuals that a smoothed velocity leaves are lines in time, which coloured noise would explain as well.
         """
         plain, moments = present_noise(view, lin.residual), view.moments(lin, white=True)
         starts = here.starts[self._view(here.part)[0]]
         left = updated_noise(view, moments, plain, here.theta, starts, self.prior, coloured=False)
-        return bool(2.0 * np.log(left.sd / plain.sd).mean() < np.log(0.1))
+        return bool(2.0 * np.log(left.sd / plain.sd).mean() < _EXPLAINED)
 
     def _noise_takes_over(self, view: Windows, here: Here, lin: Linearisation) -> tuple[bool, float]:
         """Whether coloured noise would move theta farther from plain least squares than coloured noise itself could.
@@ -629,9 +640,28 @@ class SegmentSolver:
             thetas.append(theta)
             changes.append(solved.blocks(move))
         stacked, all_starts = np.stack(thetas), starts + np.stack(changes)
-        best, residual, lowest = best_step(view, stacked, all_starts, energy, now, 0.1 * tolerance)
+        best, residuals, values = best_step(view, stacked, all_starts, energy, now, 0.1 * tolerance)
         damping = float(here.damping * _DAMPINGS[best])
-        return _Trial(stacked[best], all_starts[best], residual, now - lowest, expected, damping), scale
+        trial = _Trial(stacked[best], all_starts[best], residuals[best], now - float(values[best]), expected, damping)
+        point, foretold = _Point(stacked[0], all_starts[0], residuals[0], float(values[0])), now - expected
+        for _ in range(_CORRECTIONS if trial.gained < 0.75 * expected and np.isfinite(values[0]) else 0):
+            before, point = point, self._corrected(view, here, lin, energy, point)
+            if point.energy - foretold > 0.6 * (before.energy - foretold):
+                break
+            if now - point.energy > trial.gained + 0.1 * tolerance:
+                trial = _Trial(*point[:3], now - point.energy, expected, float(here.damping * _DAMPINGS[0]))
+        return trial, scale
+
+    def _corrected(self, view: Windows, here: Here, lin: Linearisation, energy: WindowEnergy, at: _Point) -> _Point:
+        """A further step by the same linearisation, from where an earlier one led (V. Shamanskii 1967)."""
+        n, damping = view.num_theta, float(here.damping * _DAMPINGS[0])
+        normal = view.moments(replace(lin, residual=at.residual), white=here.white).normal(energy.noise)
+        solved = eliminate_starts(normal, n, view.start_precision, -view.start_precision * at.starts, damping)
+        hessian = solved.precision + self.prior.precision + FLAT_PRECISION * np.eye(n)
+        theta = self._moved(hessian, solved.gradient + self.prior.pull(at.theta), at.theta, damping)
+        starts = at.starts + solved.blocks(theta - at.theta)
+        (residual,), (valid,) = view.residuals(theta[None], starts[None])
+        return _Point(theta, starts, residual, energy(theta, starts, residual) if valid else np.inf)
 
     def _leaves_no_room(self) -> bool:
         """Whether the budget leaves no room for another step."""
@@ -705,8 +735,10 @@ class SegmentSolver:
         return replace(state, optima=(*ends, optimum))
 
     def _is_poor(self, optimum: WindowOptimum) -> bool:
-        """Whether residuals are far larger than what samples scatter by, and a good part of what channels do."""
+        """Whether it has a finding, or residuals far larger than samples scatter by and a good part of the motion."""
         windows = self.windows
+        if optimum.finding is not None:
+            return True
         large = optimum.sd > 0.1 * windows.spread
         return bool((large & (optimum.sd > self.tuning.poor * windows.level.sd)).any())
 
@@ -777,19 +809,23 @@ class SegmentSolver:
         points, here = np.concatenate([state.points, theta[None]]), self._begin_fit(state, theta, state.here.enough > 0)
         return replace(state, points=points, point=len(state.points), here=here, elsewhere=True)
 
-    @property
-    def _tells(self) -> bool:
-        """Whether a plain fit tells anything: initial states are measured."""
-        return self.windows.starts_measured or self.windows.rates_measured
-
     def _is_worth_looking(self, state: SolverState) -> bool:
-        """Whether another optimum is worth looking for: from a poor fit, or from one that has converged."""
-        options, ends = self.problem.options, [one for one in state.optima if not one.early]
-        most = self.tuning.most_points if self._tells else options.restarts
+        """Whether another optimum is worth looking for: with restarts left, and where none led back to another."""
+        options, ends, windows = self.problem.options, [one for one in state.optima if not one.early], self.windows
+        most = self.tuning.most_points if windows.starts_measured or windows.rates_measured else options.restarts
         asked = options.restarts > 1 and options.initial is None and len(state.points) < most
-        if not asked or self._beginnings or any(one.holds(ends[-1]) for one in ends[:-1]):
+        return asked and not self._beginnings and not any(one.holds(ends[-1]) for one in ends[:-1])
+
+    def _tells(self, optimum: WindowOptimum) -> bool:
+        """Whether a plain fit tells anything: measured initial states leave little beside an optimum's noise."""
+        windows = self.windows
+        if not (windows.starts_measured or windows.rates_measured):
             return False
-        return self._is_poor(ends[-1]) or (self._tells and all(one.finding is None for one in state.optima))
+        view = self._take_few(1)
+        with windows.counting(view):
+            residual, valid = view.residuals(optimum.theta[None], view.no_starts(1))
+        left = present_noise(view, residual[0])
+        return bool(valid[0] and 2.0 * np.log(optimum.sd / left.sd).mean() > _EXPLAINED)
 
     def _find_elsewhere(self, state: SolverState) -> FloatArray | None:
         """Where plain least squares fit as well as at the optima, theta (N,); None if nowhere.
@@ -798,8 +834,9 @@ class SegmentSolver:
         smallest part. Where initial states are not measured it is the best draw itself.
         """
         last, n, optima = state.optima[-1], self.windows.num_theta, [one.theta for one in state.optima]
-        points = self._pick_drawn(state) if self._is_poor(last) else []
-        if not self._tells:
+        poor = self._is_poor(last)
+        points = self._pick_drawn(state) if poor else []
+        if not self._tells(last):
             return next(iter(points), None)
         points += self._pick_far(last.theta, np.diag(last.covariance) < 0.1**2)  # of others the log says little
         few = self._take_few((6 * len(points) + 2 * len(optima)) * (n + 3))  # most take six steps, from an optimum two
@@ -807,8 +844,8 @@ class SegmentSolver:
             if not points:
                 return None
             ends = self._follow(view, optima, points)
-            points = [end.theta for end in ends[len(optima) :]]
-        return next((point for point in points if self._is_as_good(view, ends[0].theta, point)), None)
+            points = [end.theta for end in ends[0 if poor else len(optima) :]]  # a poor optimum may be none of a few
+        return next((point for point in points if self._is_as_good(view, ends[0].theta, point, poor)), None)
 
     def _follow(self, view: Windows, optima: list[FloatArray], points: list[FloatArray]) -> list[_End]:
         """Ends of plain fits from the optima; then of those from the points that end elsewhere and fit as well."""
@@ -866,8 +903,8 @@ class SegmentSolver:
                 break
         return None if energy > worst else _End(here.theta, energy, step.hessian)
 
-    def _is_as_good(self, view: Windows, theta: FloatArray, other: FloatArray) -> bool:
-        """Whether another theta (N,) fits as well, and what lies between fits worse.
+    def _is_as_good(self, view: Windows, theta: FloatArray, other: FloatArray, poor: bool) -> bool:
+        """Whether another theta (N,) fits better than a ``poor`` one; or as well, and what lies between fits worse.
 
         Fits are compared segment by segment (Q. Vuong 1989, Econometrica 57, 307). Ten nats as ``distinct``.
         """
@@ -877,8 +914,10 @@ class SegmentSolver:
             residual, valid = view.residuals(thetas, view.no_starts(len(thetas)))
         energy = 0.5 * ((residual / present_noise(view, residual[0]).sd) ** 2).sum((2, 3))
         worse, barrier = energy[1] - energy[0], energy[2:].sum(1) - energy[:2].sum(1).max()
-        clearly = worse.sum() > max(10.0, 3.0 * np.sqrt(len(worse)) * worse.std())
-        return bool(not clearly and (barrier[valid[2:]].max(initial=-np.inf) > 10.0 or not valid.all()))
+        clear = max(10.0, 3.0 * np.sqrt(len(worse)) * worse.std())
+        if worse.sum() > clear or (poor and worse.sum() < -clear):
+            return bool(worse.sum() < 0)
+        return bool(barrier[valid[2:]].max(initial=-np.inf) > 10.0 or not valid.all())
 
     def _is_behind(self, state: SolverState, here: Here, keep: IntArray, view: Windows) -> bool:
         """Whether the best optimum fits the segments (K,) of a part better by more nats than ``distinct`` keeps."""
@@ -908,8 +947,8 @@ def best_step(
     energy: Callable[[FloatArray, FloatArray, FloatArray], float],
     now: float,
     slack: float,
-) -> tuple[int, FloatArray, float]:
-    """Of ever shorter steps to thetas (M, N) and starts (M, W, D) the best one: its number, residual and energy.
+) -> tuple[int, FloatArray, FloatArray]:
+    """Of ever shorter steps to thetas (M, N) and starts (M, W, D) the best: its number, all residuals and energies.
 
     From an energy ``now`` it is the shortest that gains half of what the best gains, and all but ``slack`` nats: where
     a log tells little, parameters stay near the model as given.
@@ -919,7 +958,7 @@ def best_step(
     values = np.array([energy(t, s, r) if ok else np.inf for t, s, r, ok in each])
     lowest = float(values.min())
     best = int(np.flatnonzero(values <= lowest + min(slack, max(0.5 * (now - lowest), 0.0)))[-1])
-    return best, residuals[best], float(values[best])
+    return best, residuals, values
 
 
 def _log_errors(view: Windows, residual: FloatArray) -> FloatArray:

@@ -57,17 +57,16 @@ def averaged(problem: SearchProblem, chain: Chain, fit: ChainFit) -> FloatArray:
     axes, rng = _axes(of_noise, logs, average), np.random.default_rng([problem.seed, 2])
     here, solved = at(logs)
     beside, means, covariances = normal(solved), [], []
-    for draw in range(1, average.draws + 1):
+    for draw in range(average.draws):
         proposed = logs + average.step * rng.standard_normal() * axes[draw % len(axes)]
         value, solved = at(proposed)
         if np.log(rng.random()) < value - here:
             logs, here, beside = proposed, value, normal(solved)
         means.append(beside[0])
         covariances.append(beside[1])
-        if draw % average.round == 0:
-            halves = (slice(draw // 2), slice(draw // 2, None))
-            sds = [np.log(np.diag(_spread(means[half], covariances[half]))) / 2 for half in halves]
-            if np.abs(sds[1] - sds[0]).max() < average.alike:
+        if (draw + 1) % average.round == 0:
+            scatter = np.log([np.diag(one) for one in covariances]).std(0).max() / 2
+            if scatter * np.sqrt(2 * len(axes) / (draw + 1)) < average.exact:
                 break
     return _spread(means, covariances)
 

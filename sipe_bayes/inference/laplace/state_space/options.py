@@ -23,8 +23,8 @@ class AverageTuning:
     """How theta's normal is averaged over the noise; see ``noise_average``."""
 
     draws: ClassVar[int] = 800  # Metropolis steps at most, along one axis of the noise each: an eliminated chain
-    round: ClassVar[int] = 200  # of them, after which it ends where both halves agree
-    alike: ClassVar[float] = 0.02  # by which the logarithms of their sds may differ
+    round: ClassVar[int] = 100  # of them, after which it ends where the sds are known
+    exact: ClassVar[float] = 0.01  # to so much (of each)
     step: ClassVar[float] = 2.4  # length of a step (sds of the normal)
     least_curvature: ClassVar[float] = 0.5  # of an axis, which bounds that sd: process noise may be open below
     difference: ClassVar[float] = 0.2  # of the logarithms, for the curvature
