@@ -11,8 +11,10 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
    segments first, then on as many as ``linearised_steps`` allows. Its end is the plain fit, the first answer. Of steps
    that gain about the same the shortest is taken: what a log leaves open stays near the model as given.
 2. FIT: theta and the initial states, noise by restricted likelihood before each step; on the same part, then on
-   ``whole`` times as many segments. Columns of the initial states are kept while they predict what a step gains. The
-   first step holds plain against generalised least squares (``_noise_takes_over``).
+   ``whole`` times as many segments. Columns of the initial states are kept while they predict what a step gains. Where
+   a step gains less than three quarters of what it promised, further ones by the same linearisation lead back into a
+   curved valley. The first step after which initial states explain no more than a tenth of the residuals' squares holds
+   plain against generalised least squares (``_noise_takes_over``).
 3. COMPARE: the plain fit and the posterior mode each run free along the whole training logs. Where the mode is worse by
    more than 3 %, coloured noise explains what parameters should.
 
@@ -26,9 +28,11 @@ are those of the posterior's width, whatever dry friction or a delay does below 
 
 **Other optima** that fit as well are looked for after the fit, unless ``restarts`` is one: two distances of a centre of
 mass from its joint give a pendulum one period. Plain fits go down from four points far from the optimum, and from the
-best draws of the prior where residuals are larger than ``poor`` times the samples' scatter; first on few segments, a
-twentieth of the cost so far, then on the smallest part. If one ends elsewhere, fits as well, and what lies between fits
-worse, FIT follows it. All optima are kept, weighted by their evidence.
+best draws of the prior where residuals are larger than ``poor`` times the samples' scatter; first on half seconds of
+few segments, mostly a twentieth of the cost so far, then on the smallest part. If one ends elsewhere, fits as well, and
+what lies between fits worse, FIT follows it; from known states also if it fits better than a poor optimum. All optima
+are kept, weighted by their evidence. Where measured initial states leave far more than the noise, plain fits tell
+nothing, and there is no such look.
 
 **Impacts** make simulations jump. There beginnings of the segments are fitted first, two control steps and then ever
 more. On the shortest ones plain fits go down from the nominal model and the best of some draws from the prior; the best
@@ -83,6 +87,7 @@ _SCOUTED_STEPS = 16  # after which the next of them is followed: most fits that 
 _SCOUTS = 4  # of them that are followed on the shortest beginnings
 _CORRECTIONS = 6  # further steps at most by a linearisation of which a step gains too little
 _EXPLAINED = math.log(0.1)  # share of the squares that initial states leave where they explain most of them
+_LOOK = 0.5  # seconds of a segment that a first look at other optima takes
 _WORSE = 1.03  # free-run error over the plain fit's from which white noise takes over
 
 
@@ -835,6 +840,7 @@ class SegmentSolver:
         """
         last, n, optima = state.optima[-1], self.windows.num_theta, [one.theta for one in state.optima]
         poor = self._is_poor(last)
+        better = poor and not self.windows.num_start  # then the last optimum need be none of plain least squares
         points = self._pick_drawn(state) if poor else []
         if not self._tells(last):
             return next(iter(points), None)
@@ -844,8 +850,8 @@ class SegmentSolver:
             if not points:
                 return None
             ends = self._follow(view, optima, points)
-            points = [end.theta for end in ends[0 if poor else len(optima) :]]  # a poor optimum may be none of a few
-        return next((point for point in points if self._is_as_good(view, ends[0].theta, point, poor)), None)
+            points = [end.theta for end in ends[0 if better else len(optima) :]]
+        return next((point for point in points if self._is_as_good(view, ends[0].theta, point, better)), None)
 
     def _follow(self, view: Windows, optima: list[FloatArray], points: list[FloatArray]) -> list[_End]:
         """Ends of plain fits from the optima; then of those from the points that end elsewhere and fit as well."""
@@ -877,13 +883,17 @@ class SegmentSolver:
         return [one for one in best if (one != theta).any()][: options.restarts - 1]
 
     def _take_few(self, thetas: int) -> Windows:
-        """So few segments that simulations of ``thetas`` take a twentieth of what the fit took, mostly less; or two."""
+        """So few segments that simulations of ``thetas`` take a twentieth of what the fit took, mostly less; or two.
+
+        Of longer ones the first half second.
+        """
         windows = self.windows
-        room = 0.05 * windows.rollouts / len(windows.trajectories) * windows.num_windows / max(thetas, 1)
-        count = min(max(int(room), 2), len(self._view(0)[0]))
         if not windows.has_parts:
             return windows
-        return windows.part(((np.arange(count) + 0.5) * windows.num_windows / count).astype(int))
+        room = 0.05 * windows.rollouts / len(windows.trajectories) * windows.num_windows / max(thetas, 1)
+        count = min(max(int(room), 2), len(self._view(0)[0]))
+        few = windows.part(((np.arange(count) + 0.5) * windows.num_windows / count).astype(int))
+        return few.beginnings(windows.telling_steps(math.ceil(_LOOK / float(few.dt.min()))))
 
     def _descend(self, view: Windows, theta: FloatArray, known: list[_End]) -> _End | None:
         """Where plain least squares end from theta (N,); None where that is near a known end or fits worse than it."""
@@ -903,8 +913,8 @@ class SegmentSolver:
                 break
         return None if energy > worst else _End(here.theta, energy, step.hessian)
 
-    def _is_as_good(self, view: Windows, theta: FloatArray, other: FloatArray, poor: bool) -> bool:
-        """Whether another theta (N,) fits better than a ``poor`` one; or as well, and what lies between fits worse.
+    def _is_as_good(self, view: Windows, theta: FloatArray, other: FloatArray, better: bool) -> bool:
+        """Whether another theta (N,) fits as well, and what lies between fits worse; or, if asked, clearly ``better``.
 
         Fits are compared segment by segment (Q. Vuong 1989, Econometrica 57, 307). Ten nats as ``distinct``.
         """
@@ -915,7 +925,7 @@ class SegmentSolver:
         energy = 0.5 * ((residual / present_noise(view, residual[0]).sd) ** 2).sum((2, 3))
         worse, barrier = energy[1] - energy[0], energy[2:].sum(1) - energy[:2].sum(1).max()
         clear = max(10.0, 3.0 * np.sqrt(len(worse)) * worse.std())
-        if worse.sum() > clear or (poor and worse.sum() < -clear):
+        if worse.sum() > clear or (better and worse.sum() < -clear):
             return bool(worse.sum() < 0)
         return bool(barrier[valid[2:]].max(initial=-np.inf) > 10.0 or not valid.all())
 

@@ -9,9 +9,10 @@
 4. At an optimum, or where the noise does not settle, jumps that stand out become outliers (``outlying_jumps``) and the
    search goes on; from the optimum without them the filter tries to make do without outliers, and where that is
    likelier the search goes on from there, until it comes to nothing likelier.
-5. WIDEN: where differences as long as the posterior is wide (``posterior_linearisation``) say something else of it than
-   short ones did, or the noise did not settle with these, the search goes on with them; what that ends in takes the
-   optimum's place. Then the next starting point.
+5. WIDEN: as soon as steps by short differences have to be damped to less than half (``SmoothingTuning.blind``), as
+   where contacts open and close, the search goes on with differences as long as the posterior is wide
+   (``posterior_linearisation``); from an optimum where they say something else of it than short ones did, or its noise
+   did not settle. What that ends in takes the optimum's place. Then the next starting point, where the fit is poor.
 6. Where not every state is measured, and process noise explains much of the logs, or draws find that the best optimum
    is not the posterior's (``inference.importance.judged``), segments of the logs lead to a further starting point.
 
