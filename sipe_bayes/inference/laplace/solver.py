@@ -88,6 +88,7 @@ _SCOUTS = 4  # of them that are followed on the shortest beginnings
 _CORRECTIONS = 6  # further steps at most by a linearisation of which a step gains too little
 _EXPLAINED = math.log(0.1)  # share of the squares that initial states leave where they explain most of them
 _LOOK = 0.5  # seconds of a segment that a first look at other optima takes
+_SILENT = math.log(0.02)  # from which plain fits tell nothing: the pendulum that needs them has 0.03, an arm 0.016
 _WORSE = 1.03  # free-run error over the plain fit's from which white noise takes over
 
 
@@ -830,7 +831,7 @@ class SegmentSolver:
         with windows.counting(view):
             residual, valid = view.residuals(optimum.theta[None], view.no_starts(1))
         left = present_noise(view, residual[0])
-        return bool(valid[0] and 2.0 * np.log(optimum.sd / left.sd).mean() > _EXPLAINED)
+        return bool(valid[0] and 2.0 * np.log(optimum.sd / left.sd).mean() > _SILENT)
 
     def _find_elsewhere(self, state: SolverState) -> FloatArray | None:
         """Where plain least squares fit as well as at the optima, theta (N,); None if nowhere.
