@@ -18,15 +18,19 @@ from typing import ClassVar
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.inference.importance import Target
+from sipe_bayes.inference.importance import ImportanceTuning, Target
 
 
 class StretchTuning:
     """How far a posterior is looked at beyond its normal, and what counts."""
 
     far: ClassVar[float] = 8.0  # sds, the first points; where the density holds on, twice as far again
-    slack: ClassVar[float] = 0.5  # nats, by which falls of the log posterior may differ for rounding's sake
-    least_fall: ClassVar[float] = 0.6  # a fall, over that of the normal, which is none too small
+    slack: ClassVar[float] = (
+        ImportanceTuning.slack
+    )  # nats, by which falls of the log posterior may differ for rounding's sake
+    least_fall: ClassVar[float] = (
+        ImportanceTuning.least_fall
+    )  # a fall, over that of the normal, which is none too small
     unseen: ClassVar[float] = 0.01  # of the normal's mass, which a stretch has to have to count
     most: ClassVar[int] = 6  # stretches drawn from
 

@@ -26,7 +26,7 @@ from tests.problems.swings import swing, write_case
 def test_a_larger_budget_goes_on_in_the_same_folder(tmp_path: Path) -> None:
     config = write_case(tmp_path, swing())
     whole = run(config, budget=4000, out=tmp_path / "whole")
-    short = run(config, budget=whole.rollouts // 3, out=tmp_path / "out")
+    short = run(config, budget=whole.rollouts // 2, out=tmp_path / "out")
     blocking = {item.code for item in Findings(short.findings).blocking}
     assert blocking & {Code.BUDGET_SPENT, Code.SEARCH_CUT_SHORT, Code.NOT_JUDGED}
     on = run(config, budget=4000, out=tmp_path / "out")

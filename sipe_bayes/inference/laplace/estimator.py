@@ -23,12 +23,11 @@ from sipe_bayes.inference.laplace.optimum import WindowOptimum, WindowState, not
 from sipe_bayes.inference.laplace.options import LaplaceOptions
 from sipe_bayes.inference.laplace.solver import SegmentSolver, SolverState
 from sipe_bayes.inference.laplace.state_space.chain_draws import blur, draws_size, looked_beyond
-from sipe_bayes.inference.laplace.state_space.known_starts import KnownStartSearch, KnownStartState
 from sipe_bayes.inference.laplace.state_space.noise import excess
 from sipe_bayes.inference.laplace.state_space.noise_average import averaged
-from sipe_bayes.inference.laplace.state_space.search import StateSpaceSearch, StateSpaceState
+from sipe_bayes.inference.laplace.state_space.search import StateSpaceSearch
 from sipe_bayes.inference.laplace.state_space.several_linearisations import linearisations_cost, scattered
-from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, contradiction
+from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, ChainState, contradiction
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
 from sipe_bayes.inference.laplace.target import Target, WindowFit, WindowTarget
@@ -55,7 +54,7 @@ class LaplaceState:
         done: whether all have ended.
     """
 
-    search: SolverState | WindowState | StateSpaceState | KnownStartState
+    search: SolverState | WindowState | ChainState
     draws: Draws | None = None
     given: int = 0
     judgements: tuple[Judgement, ...] = ()
@@ -72,7 +71,7 @@ class Laplace(Estimator[LaplaceState]):
             best of four are followed, and as many again, at most twice. With 1 there is one, and no second optimum is
             looked for.
         candidates: points among which they are chosen: draws from the prior and, of 40 or more, later ones around the
-            best; without effect where ``state_space.known_starts`` finds them.
+            best.
         initial: (R, N), the starting points themselves instead.
         tuning: numbers of the search itself.
     """
@@ -138,7 +137,7 @@ class Laplace(Estimator[LaplaceState]):
         try:
             if state.search.done:
                 assert isinstance(strategy, StateSpaceSearch)
-                assert isinstance(state.search, StateSpaceState)
+                assert isinstance(state.search, ChainState)
                 search = strategy.lead(state.search)
             else:
                 search = strategy.step(state.search)
@@ -182,8 +181,7 @@ class Laplace(Estimator[LaplaceState]):
         """The search that fits the likelihood."""
         if not isinstance(windows, Chain):
             return SegmentSolver(self.problem, windows)
-        known = windows.settings.starts == "recorded"
-        return KnownStartSearch(self.problem, windows) if known else StateSpaceSearch(self.problem, windows)
+        return StateSpaceSearch(self.problem, windows)
 
     def _probed(self, windows: Windows | Chain, state: LaplaceState) -> LaplaceState:
         """The state of a finished search; not done where the posterior is no normal and draws are to take its place."""
@@ -211,12 +209,13 @@ class Laplace(Estimator[LaplaceState]):
         more = look.draws is not None and windows.has_room(draw_size(self.problem, windows, kept))
         return replace(ended, done=not more)
 
-    def _may_lead(self, chain: Chain, search: WindowState | StateSpaceState | KnownStartState) -> bool:
+    def _may_lead(self, chain: Chain, search: WindowState | ChainState) -> bool:
         """Whether a finished search may go on from where segments lead: once, where not every state is measured.
 
-        Not where bodies strike, which segments do not follow.
+        Not from known first states; nor where bodies strike, which segments do not follow.
         """
-        if not isinstance(search, StateSpaceState) or search.led or chain.determined.all():
+        known = chain.settings.starts == "recorded"
+        if not isinstance(search, ChainState) or search.led or known or chain.determined.all():
             return False
         return not contacts_of(chain.simulator, [replace(log, states=None) for log in chain.trajectories]).change
 

@@ -13,7 +13,7 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
 2. FIT: theta and the initial states, noise by restricted likelihood before each step; on the same part, then on
    ``whole`` times as many segments. Columns of the initial states are kept while they predict what a step gains. Where
    a step gains less than three quarters of what it promised, further ones by the same linearisation lead back into a
-   curved valley. The first step after which initial states explain no more than a tenth of the residuals' squares holds
+   curved valley. The first step after which initial states do not explain nearly all of the residuals holds
    plain against generalised least squares (``_noise_takes_over``).
 3. COMPARE: the plain fit and the posterior mode each run free along the whole training logs. Where the mode is worse by
    more than 3 %, coloured noise explains what parameters should.
@@ -86,9 +86,8 @@ _THROUGH_IMPACTS = 100  # draws from the prior, of which the best are followed w
 _SCOUTED_STEPS = 16  # after which the next of them is followed: most fits that settle do so by then
 _SCOUTS = 4  # of them that are followed on the shortest beginnings
 _CORRECTIONS = 6  # further steps at most by a linearisation of which a step gains too little
-_EXPLAINED = math.log(0.1)  # share of the squares that initial states leave where they explain most of them
 _LOOK = 0.5  # seconds of a segment that a first look at other optima takes
-_SILENT = math.log(0.02)  # from which plain fits tell nothing: the pendulum that needs them has 0.03, an arm 0.016
+_SILENT = -3.9  # log share of squares left where initial states explain the rest: plain fits tell nothing then
 _WORSE = 1.03  # free-run error over the plain fit's from which white noise takes over
 
 
@@ -567,14 +566,14 @@ class SegmentSolver:
         return replace(here, part=self._last(Stage.PLAIN, white=True), enough=enough)
 
     def _starts_explain(self, view: Windows, here: Here, lin: Linearisation) -> bool:
-        """Whether initial states explain nine tenths of the squares that least squares leave: they come first then.
+        """Whether initial states explain nearly all that plain least squares leave: they come first then.
 
         Residuals that a smoothed velocity leaves are lines in time, which coloured noise would explain as well.
         """
         plain, moments = present_noise(view, lin.residual), view.moments(lin, white=True)
         starts = here.starts[self._view(here.part)[0]]
         left = updated_noise(view, moments, plain, here.theta, starts, self.prior, coloured=False)
-        return bool(2.0 * np.log(left.sd / plain.sd).mean() < _EXPLAINED)
+        return bool(2.0 * np.log(left.sd / plain.sd).mean() < _SILENT)
 
     def _noise_takes_over(self, view: Windows, here: Here, lin: Linearisation) -> tuple[bool, float]:
         """Whether coloured noise would move theta farther from plain least squares than coloured noise itself could.
@@ -650,7 +649,8 @@ class SegmentSolver:
         damping = float(here.damping * _DAMPINGS[best])
         trial = _Trial(stacked[best], all_starts[best], residuals[best], now - float(values[best]), expected, damping)
         point, foretold = _Point(stacked[0], all_starts[0], residuals[0], float(values[0])), now - expected
-        for _ in range(_CORRECTIONS if trial.gained < 0.75 * expected and np.isfinite(values[0]) else 0):
+        short = trial.gained < 0.75 * expected and np.isfinite(values[0]) and not self._beginnings
+        for _ in range(_CORRECTIONS if short else 0):
             before, point = point, self._corrected(view, here, lin, energy, point)
             if point.energy - foretold > 0.6 * (before.energy - foretold):
                 break

@@ -1,6 +1,6 @@
 """What ``laplace`` asks of a search for optima, and what it gives it.
 
-A ``Strategy`` is a class for one kind of likelihood: ``SegmentSolver``, ``StateSpaceSearch`` and ``KnownStartSearch``.
+A ``Strategy`` is a class for one kind of likelihood: ``SegmentSolver`` and ``StateSpaceSearch``.
 It is made of a ``SearchProblem`` and the bound logs, writes ``start`` and ``step`` over its own frozen state, and hands
 over ``Optimum``s.
 """

@@ -35,7 +35,6 @@ class OutlierTuning:
 
     stands_out: ClassVar[float] = 2.5  # size from which a jump is proposed (of the median jump)
     most: ClassVar[float] = 0.05  # share of the jumps that may be outliers, also the probability of one
-    unsettled_after: ClassVar[int] = 4  # estimates of the noise after which an unsettled search proposes some
     proposals: ClassVar[int] = 3  # how often a search proposes some
 
 
@@ -85,5 +84,4 @@ class ChainTuning:
     outliers: ClassVar[OutlierTuning] = OutlierTuning()  # which jumps become outliers
     smoothing: ClassVar[SmoothingTuning] = SmoothingTuning()  # the search from measured states
     wide: ClassVar[WideTuning] = WideTuning()  # steps by differences as long as the posterior is wide
-    horizon: ClassVar[float] = 0.4  # of the budget, for starting points from known first states
     absorbed: ClassVar[float] = 0.1  # share of the samples that process noise explains, from which segments lead

@@ -1,4 +1,4 @@
-"""Steps of a smoother whose differences are as long as the posterior is wide, and what both searches make of them.
+"""Steps of a smoother whose differences are as long as the posterior is wide.
 
 A control step jumps where a contact opens or closes. A short difference across such a jump is a slope of jump by
 length: one of them in a log outweighs all that the other steps say of a parameter, and its interval is a hundredth of
@@ -14,12 +14,10 @@ a step promises no more than fitting the log's noise would.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from dataclasses import replace
 
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.laplace.state_space.noise import NoisePosterior, excess, infer_noise
 from sipe_bayes.inference.laplace.state_space.smoother import smooth, solvable
@@ -36,32 +34,7 @@ from sipe_bayes.likelihood.state_space.differences import linearise_by
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states
 
 
-@dataclass(frozen=True)
-class WidePosition(Position):
-    """Where the search from one starting point stands.
-
-    Args:
-        theta_step: (N,), of the next differences; short ones where all are zero.
-        state_step: (K, D).
-        estimate_theta: (N,), where the noise was estimated last.
-        back: whether the search has come back to where it was likeliest, for the noise to settle.
-    """
-
-    theta_step: FloatArray = field(default_factory=lambda: np.zeros(0))
-    state_step: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    estimate_theta: FloatArray = field(default_factory=lambda: np.zeros(0))
-    back: bool = False
-
-    @property
-    def is_wide(self) -> bool:
-        """Whether differences have the posterior's lengths."""
-        return bool(self.state_step.any())
-
-
-S = TypeVar("S", bound=ChainState[Any])
-
-
-class WideSearch(ChainSearch[S]):
+class WideSearch(ChainSearch):
     """A search with steps by such differences."""
 
     @property
@@ -69,21 +42,21 @@ class WideSearch(ChainSearch[S]):
         """Rollouts that a step takes."""
         return (2 * (self.chain.num_theta + self.chain.num_start) + 2) * len(self.chain.trajectories)
 
-    def _linearised(self, here: WidePosition) -> ChainLinearisation | None:
+    def _linearised(self, here: Position) -> ChainLinearisation | None:
         """Over the surroundings that are open, after short differences first."""
         return linearise_by(self.chain, here.theta, here.states, here.theta_step, here.state_step)
 
-    def onward(self, state: S) -> S:
+    def onward(self, state: ChainState) -> ChainState:
         """At the next starting point where the fit is poor: unsettled, or with noise far above the samples' scatter."""
         best = state.recorded
         poor = best is None or not best.settled or excess(self.chain, best.sd).max() > THRESHOLDS.noise_excess
         return state.next_point(self._begin) if poor else replace(state, done=True)
 
-    def wide_smooth(self, state: S, linear: ChainLinearisation) -> S:
+    def wide_smooth(self, state: ChainState, linear: ChainLinearisation) -> ChainState:
         """A step of theta and all states."""
         return self._stepped(state, linear, solvable(linear, state.here.noise))
 
-    def wide_noise(self, state: S, linear: ChainLinearisation) -> S:
+    def wide_noise(self, state: ChainState, linear: ChainLinearisation) -> ChainState:
         """An estimate of the noise, which may be worth recording, and a step unless the noise gains more."""
         state, noise, ends = self.estimated(state, linear)
         if ends:
@@ -95,7 +68,7 @@ class WideSearch(ChainSearch[S]):
         except BudgetExhausted:
             return state  # what was recorded is kept, and the next step ends the search
 
-    def _stepped(self, state: S, linear: ChainLinearisation, noise: ChainNoise) -> S:
+    def _stepped(self, state: ChainState, linear: ChainLinearisation, noise: ChainNoise) -> ChainState:
         """Where a step leads, and how long the differences are there."""
         here, tuning = state.here, self.tuning.wide
         prior = self.problem.quadratic_prior
@@ -106,7 +79,7 @@ class WideSearch(ChainSearch[S]):
         state = state.at(replace(here, steps=steps, iteration=here.iteration + 1))
         return self.with_differences(state, linear, noise)
 
-    def estimated(self, state: S, linear: ChainLinearisation) -> tuple[S, ChainNoise, bool]:
+    def estimated(self, state: ChainState, linear: ChainLinearisation) -> tuple[ChainState, ChainNoise, bool]:
         """Estimate the noise anew.
 
         Returns:
@@ -143,7 +116,7 @@ class WideSearch(ChainSearch[S]):
         here = replace(here, phase=phase, noise=noise, estimates=estimates, steps=0, estimate_theta=theta)
         return state.at(here), estimate, ends
 
-    def with_differences(self, state: S, linear: ChainLinearisation, noise: ChainNoise) -> S:
+    def with_differences(self, state: ChainState, linear: ChainLinearisation, noise: ChainNoise) -> ChainState:
         """With the lengths of the next differences: the sds of theta and of the states, within limits."""
         here, tuning = state.here, self.tuning.wide
         solved = eliminate_states(linear, noise)

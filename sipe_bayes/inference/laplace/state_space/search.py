@@ -17,15 +17,14 @@
    is not the posterior's (``inference.importance.judged``), segments of the logs lead to a further starting point.
 
 Of each starting point the likeliest optimum is kept: its normal in theta, with the states integrated out, is what
-``laplace`` makes its truncated normal of. Where the logs' first states are known another search is made
-(``known_starts``).
+``laplace`` makes its truncated normal of.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,11 +40,12 @@ from sipe_bayes.inference.laplace.state_space.noise import (
     roughness,
 )
 from sipe_bayes.inference.laplace.state_space.outlying_jumps import needed, outstanding
-from sipe_bayes.inference.laplace.state_space.posterior_linearisation import WidePosition, WideSearch
+from sipe_bayes.inference.laplace.state_space.posterior_linearisation import WideSearch
 from sipe_bayes.inference.laplace.state_space.smoother import ChainPoint, smooth, solvable
 from sipe_bayes.inference.laplace.state_space.state import (
     ChainState,
     Phase,
+    Position,
     evidence,
     optimum_at,
     screened,
@@ -57,33 +57,6 @@ from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, 
 
 
 @dataclass(frozen=True)
-class SmoothingPosition(WidePosition):
-    """Where the search from one starting point stands.
-
-    Args:
-        refused: jumps (K-1,) that turned out to be no outliers.
-        proposals: how often outliers were proposed.
-    """
-
-    refused: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
-    proposals: int = 0
-
-
-@dataclass(frozen=True)
-class StateSpaceState(ChainState[SmoothingPosition]):
-    """A search from measured states.
-
-    Args:
-        regressed: thetas (R, N) at which regressions have ended.
-        led: whether segments have led to a further starting point, or failed to.
-    """
-
-    here: SmoothingPosition
-    regressed: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    led: bool = False
-
-
-@dataclass(frozen=True)
 class _Filtered:
     """Where Gauss-Newton comes from the filter's states."""
 
@@ -92,7 +65,7 @@ class _Filtered:
     energy: float
 
 
-class StateSpaceSearch(WideSearch[StateSpaceState]):
+class StateSpaceSearch(WideSearch):
     """The ``Strategy`` for a ``StateSpace``."""
 
     @property
@@ -100,15 +73,15 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         """Rollouts that a step takes."""
         return ((self.chain.num_theta + self.chain.num_start) + 2) * len(self.chain.trajectories)
 
-    def start(self) -> StateSpaceState:
+    def start(self) -> ChainState:
         """The first state: at the first starting point."""
         chain, initial = self.chain, self.problem.options.initial
         chain.rollouts += chain.setup_rollouts
         points = screened(self.problem, chain) if initial is None else initial
         none = np.empty((0, chain.num_theta))
-        return StateSpaceState(points, 0, self._begin(points[0]), uncounted=chain.uncounted, regressed=none)
+        return ChainState(points, 0, self._begin(points[0]), uncounted=chain.uncounted, regressed=none)
 
-    def phases(self) -> dict[Phase, Callable[[StateSpaceState, ChainLinearisation], StateSpaceState]]:
+    def phases(self) -> dict[Phase, Callable[[ChainState, ChainLinearisation], ChainState]]:
         """A function for each phase."""
         return {
             Phase.REGRESS: self._regress,
@@ -118,21 +91,21 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
             Phase.WIDEN: self._widen,
         }
 
-    def _linearised(self, here: WidePosition) -> ChainLinearisation | None:
+    def _linearised(self, here: Position) -> ChainLinearisation | None:
         """By short differences until there is an optimum, by theta alone for the regression."""
         if here.phase is Phase.REGRESS:
             return linearise(self.chain, here.theta, here.states, with_states=False)
         return super()._linearised(here)
 
-    def _begin(self, theta: FloatArray) -> SmoothingPosition:
+    def _begin(self, theta: FloatArray) -> Position:
         """At a starting point (N,)."""
         chain = self.chain
         phase, ones = Phase.REGRESS if chain.determined.all() else Phase.FOLLOW, np.ones(chain.num_start)
         none, damping = np.zeros(len(chain.linked), bool), self.tuning.damping.first
-        here = SmoothingPosition(phase, theta, chain.reference, unknown_noise(chain), ones, damping, refused=none)
+        here = Position(phase, theta, chain.reference, unknown_noise(chain), ones, damping, refused=none)
         return replace(here, theta_step=np.zeros(chain.num_theta), state_step=np.zeros(chain.prior_precision.shape))
 
-    def lead(self, state: StateSpaceState) -> StateSpaceState:
+    def lead(self, state: ChainState) -> ChainState:
         """A finished search, once more from where segments of the logs end; as it was where they lead nowhere."""
         chain, state = self.chain, replace(state, led=True)
         judges = 2 * self.problem.options.tuning.importance.judges  # of two optima
@@ -163,7 +136,7 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
 
     # ------------------------------------------------------------------ phases
 
-    def _regress(self, state: StateSpaceState, linear: ChainLinearisation) -> StateSpaceState:
+    def _regress(self, state: ChainState, linear: ChainLinearisation) -> ChainState:
         """A step of the regression; at its end a first guess of the noise."""
         chain, here, tuning = self.chain, state.here, self.tuning.smoothing
         theta = regress(linear, self.problem.quadratic_prior, here.theta, self.tuning.noise)
@@ -178,7 +151,7 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         here = replace(here, phase=Phase.SMOOTH, noise=noise, movement=movement)
         return replace(state, here=here, regressed=np.concatenate([state.regressed, theta[None]]))
 
-    def _follow(self, state: StateSpaceState, linear: ChainLinearisation) -> StateSpaceState:
+    def _follow(self, state: ChainState, linear: ChainLinearisation) -> ChainState:
         """The filter's states, about those that the commands lead to."""
         chain, theta, prior = self.chain, state.here.theta, self.problem.quadratic_prior
         states, tuning = state.here.states, self.tuning.noise
@@ -189,7 +162,7 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         states, noise = states if better is None else better, self._guessed(noise, movement)
         return state.at(replace(state.here, phase=Phase.SMOOTH, states=states, noise=noise, movement=movement))
 
-    def _smooth(self, state: StateSpaceState, linear: ChainLinearisation) -> StateSpaceState:
+    def _smooth(self, state: ChainState, linear: ChainLinearisation) -> ChainState:
         """A step of theta and all states; where none gains anything, an estimate of the noise at once."""
         if state.here.is_wide:
             return self.wide_smooth(state, linear)
@@ -205,7 +178,7 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         phase = Phase.NOISE if here.steps >= most else Phase.SMOOTH
         return state.at(replace(here, phase=phase, theta=point.theta, states=point.states, damping=fit.damping))
 
-    def _noise(self, state: StateSpaceState, linear: ChainLinearisation) -> StateSpaceState:
+    def _noise(self, state: ChainState, linear: ChainLinearisation) -> ChainState:
         """An estimate of the noise, and a step."""
         if state.here.is_wide:
             return self.wide_noise(state, linear)
@@ -218,14 +191,14 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         """A first guess, outliers as wide as a movement (D,), and none yet."""
         return replace(noise, wide=movement, outliers=np.zeros(len(self.chain.linked), bool))
 
-    def _estimated(self, state: StateSpaceState, linear: ChainLinearisation, still: bool) -> StateSpaceState:
+    def _estimated(self, state: ChainState, linear: ChainLinearisation, still: bool) -> ChainState:
         """Estimate the noise, and take a step, or end; still: whether no step gains anything for the old noise."""
         chain, here, tuning = self.chain, state.here, self.tuning.smoothing
         prior, noise = self.problem.quadratic_prior, solvable(linear, here.noise)
         given = NoisePosterior(chain, linear, noise, prior, here.theta, here.movement, self.tuning.noise)
         estimate, gain = infer_noise(given)
         settled, last = gain < tuning.settled and still, here.estimates >= tuning.most_estimates
-        if here.estimates and (settled or last or self._struggles(here, linear, noise)):
+        if here.estimates and (settled or last):
             return self._ended(state, linear, noise, settled)
         point, fit = smooth(chain, linear, estimate, prior, here.point, here.damping, tuning.tolerance, self.tuning)
         damping, energy = fit.damping, fit.energy
@@ -238,12 +211,6 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         here = replace(here, phase=Phase.SMOOTH, theta=point.theta, states=point.states, damping=damping)
         noise = replace(here.noise, sd=estimate.sd, process=estimate.process)
         return state.at(replace(here, noise=noise, estimates=here.estimates + 1, steps=0))
-
-    def _struggles(self, here: SmoothingPosition, linear: ChainLinearisation, noise: ChainNoise) -> bool:
-        """Whether the noise does not settle, and there are jumps that stand out."""
-        assert here.noise.outliers is not None
-        late = here.estimates >= self.tuning.outliers.unsettled_after and not here.noise.outliers.any()
-        return late and bool(self._candidates(here, linear, noise).any())
 
     def _refiltered(
         self, linear: ChainLinearisation, noise: ChainNoise, theta: FloatArray, states: FloatArray
@@ -268,9 +235,7 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
                 break
         return end
 
-    def _ended(
-        self, state: StateSpaceState, linear: ChainLinearisation, noise: ChainNoise, settled: bool
-    ) -> StateSpaceState:
+    def _ended(self, state: ChainState, linear: ChainLinearisation, noise: ChainNoise, settled: bool) -> ChainState:
         """After an optimum: keep it if it is likelier than those before, and go on from it."""
         here, tuning, before = state.here, self.tuning, state.best_evidence
         assert here.noise.outliers is not None
@@ -304,7 +269,7 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         noise = replace(here.noise, outliers=proposed)
         return state.at(replace(again, noise=noise, proposals=here.proposals + 1))
 
-    def _widened(self, state: StateSpaceState, blind: bool = False) -> StateSpaceState:
+    def _widened(self, state: ChainState, blind: bool = False) -> ChainState:
         """On with wide differences from this starting point's optimum, or from where short ones are ``blind``."""
         here, optimum = state.here, state.recorded
         if optimum is not None:
@@ -314,7 +279,7 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
         here = replace(here, phase=Phase.WIDEN, damping=self.tuning.damping.first, estimate_theta=here.theta)
         return state.at(replace(here, estimates=0, steps=0))
 
-    def _widen(self, state: StateSpaceState, linear: ChainLinearisation) -> StateSpaceState:
+    def _widen(self, state: ChainState, linear: ChainLinearisation) -> ChainState:
         """The lengths of wide differences; then whether these say anything else than short ones did."""
         noise = solvable(linear, state.here.noise)
         if not state.here.is_wide:
@@ -326,13 +291,13 @@ class StateSpaceSearch(WideSearch[StateSpaceState]):
             return self.onward(state)
         return self.wide_noise(state, linear)
 
-    def _candidates(self, here: SmoothingPosition, linear: ChainLinearisation, noise: ChainNoise) -> BoolArray:
+    def _candidates(self, here: Position, linear: ChainLinearisation, noise: ChainNoise) -> BoolArray:
         """Jumps (K-1,) to propose: none that turned out to be no outlier, and none after a few times."""
         tuning = self.tuning.outliers
         return outstanding(linear, noise, tuning) & ~here.refused & (here.proposals < tuning.proposals)
 
     def _without_outliers(
-        self, here: SmoothingPosition, linear: ChainLinearisation, noise: ChainNoise
+        self, here: Position, linear: ChainLinearisation, noise: ChainNoise
     ) -> tuple[_Filtered, float] | None:
         """Where the filter leads with no outlier, and the evidence there; None if the budget ends or it diverges."""
         regular = solvable(linear, replace(noise, outliers=np.zeros_like(here.refused)))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum, auto
-from typing import Any, Generic, Self, TypeVar
+from typing import Self
 
 import numpy as np
 import torch
@@ -54,6 +54,12 @@ class Position:
         iteration: steps until now.
         estimates: of the noise until now.
         steps: since the last of them.
+        theta_step: (N,), of the next differences; short ones where all are zero.
+        state_step: (K, D).
+        estimate_theta: (N,), where the noise was estimated last by wide ones.
+        back: whether the search has come back to where it was likeliest, for the noise to settle.
+        refused: jumps (K-1,) that turned out to be no outliers.
+        proposals: how often outliers were proposed.
     """
 
     phase: Phase
@@ -65,11 +71,22 @@ class Position:
     iteration: int = 0
     estimates: int = 0
     steps: int = 0
+    theta_step: FloatArray = field(default_factory=lambda: np.zeros(0))
+    state_step: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    estimate_theta: FloatArray = field(default_factory=lambda: np.zeros(0))
+    back: bool = False
+    refused: BoolArray = field(default_factory=lambda: np.zeros(0, bool))
+    proposals: int = 0
 
     @property
     def point(self) -> ChainPoint:
         """Its theta and states."""
         return ChainPoint(self.theta, self.states)
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether differences have the posterior's lengths."""
+        return bool(self.state_step.any())
 
 
 @dataclass(frozen=True)
@@ -162,15 +179,20 @@ def contradiction(optima: Sequence[ChainOptimum]) -> float | None:
     return furthest if chi2.sf(furthest**2, len(best.mean)) < THRESHOLDS.contradiction else None
 
 
-P = TypeVar("P", bound=Position)
-
-
 @dataclass(frozen=True)
-class ChainState(StrategyState[P]):
-    """A search over a chain of states; ``uncounted``: part of a rollout that is not counted yet."""
+class ChainState(StrategyState[Position]):
+    """A search over a chain of states.
+
+    Args:
+        uncounted: part of a rollout that is not counted yet.
+        regressed: thetas (R, N) at which regressions have ended.
+        led: whether segments have led to a further starting point, or failed to.
+    """
 
     optima: tuple[ChainOptimum, ...] = ()
     uncounted: float = 0.0
+    regressed: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    led: bool = False
 
     @property
     def recorded(self) -> ChainOptimum | None:
@@ -186,7 +208,7 @@ class ChainState(StrategyState[P]):
         """With an optimum in place of the earlier one of its starting point."""
         return replace(self, optima=(*(one for one in self.optima if one.point != optimum.point), optimum))
 
-    def after_divergence(self, begin: Callable[[FloatArray], P]) -> Self:
+    def after_divergence(self, begin: Callable[[FloatArray], Position]) -> Self:
         """Turn to the next starting point after a linearisation that diverged.
 
         Raises:
@@ -200,12 +222,9 @@ class ChainState(StrategyState[P]):
         return self.next_point(begin)
 
 
-S = TypeVar("S", bound="ChainState[Any]")
-
-
 @dataclass(frozen=True)
-class ChainSearch(Generic[S]):
-    """What both searches over a chain of states are."""
+class ChainSearch:
+    """What a search over a chain of states is, whatever its phases do."""
 
     problem: SearchProblem
     chain: Chain
@@ -216,18 +235,18 @@ class ChainSearch(Generic[S]):
         return self.problem.options.tuning.state_space
 
     @abstractmethod
-    def phases(self) -> dict[Phase, Callable[[S, ChainLinearisation], S]]:
+    def phases(self) -> dict[Phase, Callable[[ChainState, ChainLinearisation], ChainState]]:
         """What a step does in each phase with the linearisation where the search stands."""
 
     @abstractmethod
-    def _begin(self, theta: FloatArray) -> Any:
+    def _begin(self, theta: FloatArray) -> Position:
         """The position at a starting point (N,)."""
 
     @abstractmethod
-    def _linearised(self, here: Any) -> ChainLinearisation | None:
+    def _linearised(self, here: Position) -> ChainLinearisation | None:
         """The linearisation that a step needs at a position; None where it diverges."""
 
-    def step(self, state: S) -> S:
+    def step(self, state: ChainState) -> ChainState:
         """One linearisation and what follows from it; what it does is the phase's.
 
         Raises:
@@ -293,7 +312,7 @@ def evidence(
 
 def optimum_at(
     problem: SearchProblem,
-    state: ChainState[P],
+    state: ChainState,
     linear: ChainLinearisation,
     noise: ChainNoise,
     value: float,

@@ -9,11 +9,7 @@ import pytest
 import torch
 
 import sipe_bayes as sipe
-from sipe_bayes.core.findings import Code
-from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.state_space.growing_horizon import grown
-from sipe_bayes.inference.laplace.state_space.known_starts import KnownStartSearch
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
 from sipe_bayes.inference.laplace.strategy import distinct, mixture
 from sipe_bayes.likelihood.settings import StateSpace
@@ -49,70 +45,6 @@ def test_intervals_through_a_bouncing_contact_hold_the_truth() -> None:
     assert covered >= 8
     assert np.median(errors) < 0.02
     assert square < 2.65
-
-
-def grown_from(logs: list[Trajectory], **settings: object) -> tuple[np.ndarray | None, Laplace]:
-    estimator = Laplace(bouncing(), likelihood=KNOWN, **settings)  # type: ignore[arg-type]
-    return grown(estimator.problem, estimator.bound(Trajectories.stack(logs))), estimator
-
-
-def test_many_logs_and_late_samples_grow_as_well() -> None:
-    """A dozen logs, and one whose first samples are missing.
-
-    Each comes near the truth (the prior's mean is .37 off).
-    """
-    theta = np.array([0.87, 0.38, 0.5])
-    logs = [bouncing_log(theta, seed, 60) for seed in range(12)]
-    late = logs[0].observations.copy()
-    late[:13] = np.nan
-    for name, given in (("many", logs), ("late", [replace(logs[0], observations=late)])):
-        points, estimator = grown_from(given, restarts=1)
-        assert points is not None
-        print(name, points, estimator.warnings)
-        assert np.abs(points[0] - theta)[:2].max() < 0.15
-
-
-def test_a_model_that_diverges_as_given_is_said_to(monkeypatch: pytest.MonkeyPatch) -> None:
-    theta = np.array([0.87, 0.38, 0.5])
-    estimator = Laplace(bouncing(), likelihood=KNOWN, restarts=1)
-    windows = estimator.bound(Trajectories.stack([bouncing_log(theta, 0, 30)]))
-    simulator, rollout = windows.simulator, windows.simulator.rollout
-
-    def broken(thetas, *rest, **more):  # type: ignore[no-untyped-def]
-        result = rollout(thetas, *rest, **more)
-        default = np.abs(np.atleast_2d(thetas) - simulator.space.default_theta).max(1) == 0
-        result.valid[default, 1:] = False
-        return result
-
-    simulator.rollout = broken
-    monkeypatch.setattr("sipe_bayes.likelihood.windows.prompt", lambda given, contacts: given)
-    points = grown(estimator.problem, windows)
-    assert points is not None
-    assert [item.code for item in estimator.findings] == [Code.DIVERGES_AS_GIVEN]
-
-
-def test_an_estimate_that_was_made_is_not_lost_when_the_budget_ends() -> None:
-    """With every budget around the one at which the first estimate of the noise is done.
-
-    Nothing likelier is known than what is kept.
-    """
-    log, start, seen = bouncing_log(np.array([0.4, 0.6, 0.5]), 5, 60), np.array([[0.5, 0.5, 0.5]]), []
-
-    def noted(self, state, linear):  # type: ignore[no-untyped-def]
-        after = estimated(self, state, linear)
-        seen.append((self.chain.rollouts, max(one.evidence for one in after[0].optima)))
-        return after
-
-    estimated = KnownStartSearch.estimated
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(KnownStartSearch, "estimated", noted)
-        Laplace(bouncing(), likelihood=KNOWN, initial=start).fit(log)
-        (first, evidence), *_ = seen
-        for budget in range(first, first + 4):
-            estimator = Laplace(bouncing(), likelihood=KNOWN, initial=start, budget=budget)
-            estimator.fit(log)
-            assert estimator.state is not None
-            assert max(one.evidence for one in estimator.state.search.optima) >= evidence - 1e-9
 
 
 def test_mcmc_agrees_with_laplace() -> None:

@@ -12,8 +12,8 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.estimator import Laplace
 from sipe_bayes.inference.laplace.state_space import search
 from sipe_bayes.inference.laplace.state_space.noise import NoisePosterior
-from sipe_bayes.inference.laplace.state_space.search import SmoothingPosition, StateSpaceSearch, StateSpaceState
-from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, Phase, contradiction
+from sipe_bayes.inference.laplace.state_space.search import StateSpaceSearch
+from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, ChainState, Phase, Position, contradiction
 from sipe_bayes.likelihood.settings import StateSpace
 from sipe_bayes.likelihood.state_space import differences
 from tests.problems.springs import spring, spring_logs
@@ -62,7 +62,7 @@ def test_a_search_that_ends_below_its_likeliest_place_goes_back(
     alternate = np.where(np.arange(len(best.states)) % 2, 1.0, -1.0)[:, None] * np.array([1.0, 0.0])
     recorded = replace(best, settled=False)
     method = StateSpaceSearch(estimator.problem, chain)
-    elsewhere = SmoothingPosition(
+    elsewhere = Position(
         phase=Phase.NOISE,
         theta=best.theta,
         states=chain.moved(best.states, 0.5 * alternate),
@@ -76,7 +76,7 @@ def test_a_search_that_ends_below_its_likeliest_place_goes_back(
         estimate_theta=best.theta,
         refused=np.zeros(len(best.outliers), bool),
     )
-    state = StateSpaceState(best.theta[None], 0, elsewhere, (recorded,), regressed=np.empty((0, 1)))
+    state = ChainState(best.theta[None], 0, elsewhere, (recorded,), regressed=np.empty((0, 1)))
     if freedom is not None:
         monkeypatch.setattr(NoisePosterior, "freedom", freedom)
     while not state.done:

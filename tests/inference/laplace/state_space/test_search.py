@@ -13,8 +13,8 @@ from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.inference.laplace.state_space.search import StateSpaceSearch, StateSpaceState
-from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
+from sipe_bayes.inference.laplace.state_space.search import StateSpaceSearch
+from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, ChainState
 from sipe_bayes.inference.mcmc import MCMC
 from sipe_bayes.likelihood.binding import bind
 from sipe_bayes.likelihood.settings import BudgetExhausted, StateSpace
@@ -114,7 +114,7 @@ def test_a_search_that_the_budget_ends_is_judged_all_the_same(monkeypatch: pytes
     """Of an optimum after which no step fits the normal is judged and averaged, within the budget, once."""
     step, limits = StateSpaceSearch.step, []
 
-    def spent(self: StateSpaceSearch, state: StateSpaceState) -> StateSpaceState:
+    def spent(self: StateSpaceSearch, state: ChainState) -> ChainState:
         if state.optima:
             limits.append(self.chain.budget)
             raise BudgetExhausted("no step fits")
