@@ -27,7 +27,7 @@ class DampingRule:
 
     first: ClassVar[float] = 1e-4  # nearly Gauss and Newton's
     most: ClassVar[float] = 1e6  # above it a step is none
-    least_refused: ClassVar[float] = 1e-4  # damping before it grows, at least: a refused step is far off
+    least_refused: ClassVar[float] = first  # damping before it grows, at least: a refused step is far off
 
     def after(self, damping: float, lowered: bool) -> float:
         """The damping of the next step, after one that ``lowered`` the energy or did not."""

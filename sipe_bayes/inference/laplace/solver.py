@@ -76,7 +76,7 @@ from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION
 from sipe_bayes.likelihood.restricted import eliminate_starts, marginal, sandwich
-from sipe_bayes.likelihood.settings import BudgetExhausted
+from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
 from sipe_bayes.likelihood.wild_samples import wild_residuals
 from sipe_bayes.likelihood.windows import Linearisation, Windows, inward
 
@@ -85,9 +85,6 @@ _DIFFERENCE = 0.3  # conditional posterior sds that a finite difference is long
 _THROUGH_IMPACTS = 100  # draws from the prior, of which the best are followed where simulations jump
 _SCOUTED_STEPS = 16  # after which the next of them is followed: most fits that settle do so by then
 _SCOUTS = 4  # of them that are followed on the shortest beginnings
-_CORRECTIONS = 6  # further steps at most by a linearisation of which a step gains too little
-_LOOK = 0.5  # seconds of a segment that a first look at other optima takes
-_SILENT = -3.9  # log share of squares left where initial states explain the rest: plain fits tell nothing then
 _WORSE = 1.03  # free-run error over the plain fit's from which white noise takes over
 
 
@@ -573,7 +570,7 @@ class SegmentSolver:
         plain, moments = present_noise(view, lin.residual), view.moments(lin, white=True)
         starts = here.starts[self._view(here.part)[0]]
         left = updated_noise(view, moments, plain, here.theta, starts, self.prior, coloured=False)
-        return bool(2.0 * np.log(left.sd / plain.sd).mean() < _SILENT)
+        return bool(2.0 * np.log(left.sd / plain.sd).mean() < np.log(self.tuning.silent))
 
     def _noise_takes_over(self, view: Windows, here: Here, lin: Linearisation) -> tuple[bool, float]:
         """Whether coloured noise would move theta farther from plain least squares than coloured noise itself could.
@@ -650,7 +647,7 @@ class SegmentSolver:
         trial = _Trial(stacked[best], all_starts[best], residuals[best], now - float(values[best]), expected, damping)
         point, foretold = _Point(stacked[0], all_starts[0], residuals[0], float(values[0])), now - expected
         short = trial.gained < 0.75 * expected and np.isfinite(values[0]) and not self._beginnings
-        for _ in range(_CORRECTIONS if short else 0):
+        for _ in range(self.tuning.corrections if short else 0):
             before, point = point, self._corrected(view, here, lin, energy, point)
             if point.energy - foretold > 0.6 * (before.energy - foretold):
                 break
@@ -831,7 +828,7 @@ class SegmentSolver:
         with windows.counting(view):
             residual, valid = view.residuals(optimum.theta[None], view.no_starts(1))
         left = present_noise(view, residual[0])
-        return bool(valid[0] and 2.0 * np.log(optimum.sd / left.sd).mean() > _SILENT)
+        return bool(valid[0] and 2.0 * np.log(optimum.sd / left.sd).mean() > np.log(self.tuning.silent))
 
     def _find_elsewhere(self, state: SolverState) -> FloatArray | None:
         """Where plain least squares fit as well as at the optima, theta (N,); None if nowhere.
@@ -886,7 +883,7 @@ class SegmentSolver:
     def _take_few(self, thetas: int) -> Windows:
         """So few segments that simulations of ``thetas`` take a twentieth of what the fit took, mostly less; or two.
 
-        Of longer ones the first half second.
+        Of longer ones as much as a segment holds by default.
         """
         windows = self.windows
         if not windows.has_parts:
@@ -894,7 +891,7 @@ class SegmentSolver:
         room = 0.05 * windows.rollouts / len(windows.trajectories) * windows.num_windows / max(thetas, 1)
         count = min(max(int(room), 2), len(self._view(0)[0]))
         few = windows.part(((np.arange(count) + 0.5) * windows.num_windows / count).astype(int))
-        return few.beginnings(windows.telling_steps(math.ceil(_LOOK / float(few.dt.min()))))
+        return few.beginnings(windows.telling_steps(math.ceil((Segments.window or 0.0) / float(few.dt.min()))))
 
     def _descend(self, view: Windows, theta: FloatArray, known: list[_End]) -> _End | None:
         """Where plain least squares end from theta (N,); None where that is near a known end or fits worse than it."""

@@ -64,7 +64,7 @@ def averaged(problem: SearchProblem, chain: Chain, fit: ChainFit) -> FloatArray:
             logs, here, beside = proposed, value, normal(solved)
         means.append(beside[0])
         covariances.append(beside[1])
-        if (draw + 1) % average.round == 0:
+        if (draw + 1) % (average.draws // 8) == 0:
             scatter = np.log([np.diag(one) for one in covariances]).std(0).max() / 2
             if scatter * np.sqrt(2 * len(axes) / (draw + 1)) < average.exact:
                 break

@@ -23,8 +23,7 @@ class AverageTuning:
     """How theta's normal is averaged over the noise; see ``noise_average``."""
 
     draws: ClassVar[int] = 800  # Metropolis steps at most, along one axis of the noise each: an eliminated chain
-    round: ClassVar[int] = 100  # of them, after which it ends where the sds are known
-    exact: ClassVar[float] = 0.01  # to so much (of each)
+    exact: ClassVar[float] = 0.01  # relative error of the sds with which it ends earlier
     step: ClassVar[float] = 2.4  # length of a step (sds of the normal)
     least_curvature: ClassVar[float] = 0.5  # of an axis, which bounds that sd: process noise may be open below
     difference: ClassVar[float] = 0.2  # of the logarithms, for the curvature
@@ -44,7 +43,7 @@ class SmoothingTuning:
     tolerance: ClassVar[float] = 0.5  # nats that a step must promise; less does not show in an interval (nats)
     still: ClassVar[float] = 0.01  # move of theta below which the regression ends (of the cube)
     most_regressions: ClassVar[int] = 6  # steps of the regression
-    same: ClassVar[float] = 0.02  # distance of regressed thetas that is none (of the cube)
+    same: ClassVar[float] = 2 * still  # distance of regressed thetas that is none (of the cube)
     first_steps: ClassVar[int] = 3  # steps before the first estimate of the noise, which was only guessed
     steps: ClassVar[int] = 2  # steps between estimates of the noise
     most_estimates: ClassVar[int] = 10  # estimates of the noise
@@ -59,7 +58,7 @@ class SmoothingTuning:
 class WideTuning:
     """How steps by differences as long as the posterior is wide go; see ``posterior_linearisation``."""
 
-    tolerance: ClassVar[float] = 0.5  # nats that a step must promise; less does not show in an interval (nats)
+    tolerance: ClassVar[float] = SmoothingTuning.tolerance  # nats that a step must promise
     alike: ClassVar[float] = 0.3  # how far the mean, and logs of the sds, differ of normals that are alike (sd)
     steps: ClassVar[int] = 3  # steps between estimates of the noise
     most_estimates: ClassVar[int] = 20  # estimates of the noise
