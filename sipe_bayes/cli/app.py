@@ -62,7 +62,6 @@ _PIPED_WIDTH = 120
 _AXES = ("_x", "_y", "_z")
 _LINES, _SENTENCES, _WARNINGS, _CHANNELS = 20, 3, 3, 3  # that a calibration may fill, and of each kind of line
 _NAMED = 4  # of the parameters that the table has no room for
-_LONGEST, _VERDICT = 300, 44  # characters of a sentence on the terminal, and of a verdict in the table
 _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 
 
@@ -252,7 +251,7 @@ def print_calibration(calibration: Calibration) -> None:
     console.print(Text(f"{calibration.name}: posterior by {calibration.estimator}"))
     sentences = verdicts(calibration, brief=True)
     for verdict in sentences[:_SENTENCES]:
-        console.print(Text(_cut(verdict.text), style=_TONES[verdict.tone]))
+        console.print(Text(verdict.text, style=_TONES[verdict.tone]))
     below = [*_pooled(calibration), *_worst(findings, calibration.out)]
     below.append(f"{calibration.rollouts} rollouts, {calibration.seconds:.1f} s" + _report(calibration))
     _print_parameters(console, calibration, findings, _LINES - 1 - min(len(sentences), _SENTENCES) - len(below))
@@ -283,9 +282,7 @@ def _print_parameters(console: Console, calibration: Calibration, findings: Find
         ends = [significant(x, p.sd, scale) for x in p.further or ()]
         cells = [value, *[" .. ".join(ends)] * wider, f"{low} .. {high}"]
         # brackets of a name are not markup
-        table.add_row(
-            Text(p.name), *cells, unit_text(p.unit), Text(_cut(verdict.text, _VERDICT), style=_TONES[verdict.tone])
-        )
+        table.add_row(Text(p.name), *cells, unit_text(p.unit), Text(verdict.text, style=_TONES[verdict.tone]))
     # a number that is cut is a wrong one: lines that are too long are the terminal's to wrap
     console.width = max(console.width, Measurement.get(console, console.options.update(max_width=10**3), table).maximum)
     console.print(table)
@@ -326,11 +323,11 @@ def _worst(findings: Findings, out: str) -> list[str]:
     from sipe_bayes.core.findings import Code
 
     kinds = findings.kinds
-    lines = [f"warning: {_cut(text)}" for text in kinds[:_WARNINGS]]
+    lines = [f"warning: {text}" for text in kinds[:_WARNINGS]]
     if len(kinds) > len(lines):
         lines[-1] += f" [{len(kinds) - len(lines)} more in the report]"
     untold = findings.of(Code.UNTOLD)
-    lines += [f"note: {_cut(item.text)}" for item in untold]
+    lines += [f"note: {item.text}" for item in untold]
     shown = [*(item for item in findings if item.text in kinds[:_WARNINGS]), *untold]
     where = shlex.quote(out) if out else " ".join(dict.fromkeys(str(item.code) for item in shown))
     return lines + [f"what these mean and what to do: sipe explain {where}"] * bool(lines)
@@ -338,11 +335,6 @@ def _worst(findings: Findings, out: str) -> list[str]:
 
 def _report(calibration: Calibration) -> str:
     return f"; report: {Path(calibration.out) / 'report.html'}" if calibration.out else ""
-
-
-def _cut(text: str, most: int = _LONGEST) -> str:
-    """A sentence that does not fill the screen."""
-    return text if len(text) <= most else text[: text.rindex(" ", 0, most)].rstrip(",;:") + " ..."
 
 
 _PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # in the order in which a newcomer needs them
