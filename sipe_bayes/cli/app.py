@@ -284,8 +284,10 @@ def _print_parameters(console: Console, calibration: Calibration, findings: Find
         # brackets of a name are not markup
         table.add_row(Text(p.name), *cells, unit_text(p.unit), Text(verdict.text, style=_TONES[verdict.tone]))
     # a number that is cut is a wrong one: lines that are too long are the terminal's to wrap
+    width = console.width
     console.width = max(console.width, Measurement.get(console, console.options.update(max_width=10**3), table).maximum)
     console.print(table)
+    console.width = width
     rest = [p.name for p in calibration.parameters[len(shown) :]]
     if rest:
         more = [*rest[:_NAMED], *[f"{len(rest) - _NAMED} more"] * (len(rest) > _NAMED)]

@@ -25,12 +25,6 @@ class StretchTuning:
     """How far a posterior is looked at beyond its normal, and what counts."""
 
     far: ClassVar[float] = 8.0  # sds, the first points; where the density holds on, twice as far again
-    slack: ClassVar[float] = (
-        ImportanceTuning.slack
-    )  # nats, by which falls of the log posterior may differ for rounding's sake
-    least_fall: ClassVar[float] = (
-        ImportanceTuning.least_fall
-    )  # a fall, over that of the normal, which is none too small
     unseen: ClassVar[float] = 0.01  # of the normal's mass, which a stretch has to have to count
     most: ClassVar[int] = 6  # stretches drawn from
 
@@ -90,7 +84,7 @@ def stretches(
         points = np.clip(start + reached[:, None] * ways[open_ways], 0.0, 1.0)
         falls, gaps = level - target(points), points - mean
         foretold = 0.5 * (np.einsum("bi,ij,bj->b", gaps, precision, gaps) - centre @ precision @ centre)
-        small = falls + tuning.slack < tuning.least_fall * (foretold + tuning.slack)
+        small = falls + ImportanceTuning.slack < ImportanceTuning.least_fall * (foretold + ImportanceTuning.slack)
         small &= falls < tuning.least_worth(most[open_ways])
         for k in np.flatnonzero(small & (falls < tuning.least_worth(reached))):
             way = int(open_ways[k])

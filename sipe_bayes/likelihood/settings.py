@@ -95,7 +95,7 @@ class StateSpace:
         fit: names of the channels that count, default all.
         noise_sd: given sd per channel in its unit, None where it is inferred.
         starts: "estimated" with theta, or "recorded": the first of the trajectories' states is known. All other
-            recorded states count for nothing, but that the search begins there.
+            recorded states count for nothing.
 
     Raises:
         ValueError: for any other setting.

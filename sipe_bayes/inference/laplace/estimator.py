@@ -70,8 +70,7 @@ class Laplace(Estimator[LaplaceState]):
         restarts: starting points at most; more than one where the fit is poor. From known states through impacts the
             best of four are followed, and as many again, at most twice. With 1 there is one, and no second optimum is
             looked for.
-        candidates: points among which they are chosen: draws from the prior and, of 40 or more, later ones around the
-            best.
+        candidates: draws from the prior among which they are chosen.
         initial: (R, N), the starting points themselves instead.
         tuning: numbers of the search itself.
     """
@@ -101,7 +100,8 @@ class Laplace(Estimator[LaplaceState]):
     @property
     def num_start(self) -> int:
         """D, unknowns of a start."""
-        return 0 if self.likelihood.starts == "recorded" else self._coordinates
+        known = self.likelihood.starts == "recorded" and not isinstance(self.likelihood, StateSpace)
+        return 0 if known else self._coordinates
 
     @property
     def _coordinates(self) -> int:

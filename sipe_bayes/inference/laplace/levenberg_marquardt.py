@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt steps within the unit cube, for the searches over a chain of states.
+"""Levenberg-Marquardt steps within the unit cube, for the search over a chain of states.
 
 An energy, -log of likelihood x prior, is known at a point and linearised there. The states are eliminated. A quadratic
 programme over theta is left,
@@ -27,13 +27,12 @@ class DampingRule:
 
     first: ClassVar[float] = 1e-4  # nearly Gauss and Newton's
     most: ClassVar[float] = 1e6  # above it a step is none
-    least_refused: ClassVar[float] = first  # damping before it grows, at least: a refused step is far off
 
     def after(self, damping: float, lowered: bool) -> float:
         """The damping of the next step, after one that ``lowered`` the energy or did not."""
         if lowered:
             return max(1e-9, damping * 0.2)  # below it rounding rules
-        return max(damping, self.least_refused) * 8.0
+        return max(damping, self.first) * 8.0
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
 2. FIT: theta and the initial states, noise by restricted likelihood before each step; on the same part, then on
    ``whole`` times as many segments. Columns of the initial states are kept while they predict what a step gains. Where
    a step gains less than three quarters of what it promised, further ones by the same linearisation lead back into a
-   curved valley. The first step after which initial states do not explain nearly all of the residuals holds
-   plain against generalised least squares (``_noise_takes_over``).
+   curved valley. At the first step where initial states do not explain nearly all residuals, plain
+   is held against generalised least squares (``_noise_takes_over``).
 3. COMPARE: the plain fit and the posterior mode each run free along the whole training logs. Where the mode is worse by
    more than 3 %, coloured noise explains what parameters should.
 
@@ -30,9 +30,9 @@ are those of the posterior's width, whatever dry friction or a delay does below 
 mass from its joint give a pendulum one period. Plain fits go down from four points far from the optimum, and from the
 best draws of the prior where residuals are larger than ``poor`` times the samples' scatter; first on half seconds of
 few segments, mostly a twentieth of the cost so far, then on the smallest part. If one ends elsewhere, fits as well, and
-what lies between fits worse, FIT follows it; from known states also if it fits better than a poor optimum. All optima
-are kept, weighted by their evidence. Where measured initial states leave far more than the noise, plain fits tell
-nothing, and there is no such look.
+what lies between fits worse, FIT follows it. From known states FIT also follows an end that fits clearly better than a
+poor optimum. All optima are kept, weighted by their evidence. Where simulations from measured initial states miss the
+log by far more than the noise, plain fits tell nothing: a poor fit is followed by one from the best draw, no other.
 
 **Impacts** make simulations jump. There beginnings of the segments are fitted first, two control steps and then ever
 more. On the shortest ones plain fits go down from the nominal model and the best of some draws from the prior; the best
@@ -142,7 +142,7 @@ class _Trial(NamedTuple):
     """The best of a few damped steps, to theta (N,) and starts (K, D), and the residual (K, L, C) there.
 
     gained: nats, not above zero where no step lowered the energy; expected: of the least damped step, by the
-    linearisation; damping: of the best.
+    linearisation; straight: nats gained without corrections; damping: of the best.
     """
 
     theta: FloatArray
@@ -150,6 +150,7 @@ class _Trial(NamedTuple):
     residual: FloatArray
     gained: float
     expected: float
+    straight: float
     damping: float
 
 
@@ -204,7 +205,7 @@ class SegmentSolver:
 
     @property
     def step_rollouts(self) -> int:
-        """Rollouts that a step takes at most."""
+        """Rollouts that a step takes at most, without corrections, which are left out where the budget ends."""
         windows = self.windows
         return (windows.num_theta + windows.num_start + len(_DAMPINGS) + 1) * len(windows.trajectories)
 
@@ -523,7 +524,7 @@ class SegmentSolver:
         if here.enough:
             return self._ended(state, replace(here, noise=noise), lin, moments, keep, view, True)
         scale, axes = (scale, here.axes) if lengths is None else lengths
-        exact = here.exact if trial.expected < tolerance else abs(trial.gained / trial.expected - 1) < 0.05
+        exact = here.exact if trial.expected < tolerance else abs(trial.straight / trial.expected - 1) < 0.05
         after = replace(here, iteration=here.iteration + 1, noise=noise, gained=trial.gained)
         after = replace(after, exact=exact, scale=scale, axes=axes)
         slow = trial.gained < tolerance and (here.damping <= 1.0 or here.gained < tolerance)
@@ -537,12 +538,12 @@ class SegmentSolver:
         if settled or stuck or last:
             part = None if last else self._next_part(Stage.FIT, here.part)
             if part is not None and state.elsewhere and self._is_behind(state, after, keep, view):
-                return replace(state, optima=tuple(one for one in state.optima if one.finding is None), done=True)
+                return replace(state, optima=tuple(one for one in state.optima if not one.early), done=True)
             if part is not None:
                 state = self._recorded(state, self._optimum(state, after, lin, moments, keep, view, False, True))
                 return replace(state, here=replace(after, part=part, residual=None, starts_jacobian=None))
             return self._ended(state, after, lin, moments, keep, view, settled or stuck)
-        foretold = trial.gained > 0.75 * trial.expected
+        foretold = trial.straight > 0.75 * trial.expected
         kept = lin.jacobian[..., view.num_theta :] if foretold and view.num_start else None
         after = replace(after, starts_jacobian=None if kept is None else np.ascontiguousarray(kept))
         if trial.gained <= 0:
@@ -570,7 +571,12 @@ class SegmentSolver:
         plain, moments = present_noise(view, lin.residual), view.moments(lin, white=True)
         starts = here.starts[self._view(here.part)[0]]
         left = updated_noise(view, moments, plain, here.theta, starts, self.prior, coloured=False)
-        return bool(2.0 * np.log(left.sd / plain.sd).mean() < np.log(self.tuning.silent))
+        return self._share_left(left.sd, plain.sd) < self.tuning.silent
+
+    def _share_left(self, sd: FloatArray, plain: FloatArray) -> float:
+        """Of squares, by sds (C,) over the ``plain`` ones; one where all are given."""
+        free = np.isnan(self.windows.fixed_sd)
+        return float(np.exp(2.0 * np.log(sd / plain)[free].mean())) if free.any() else 1.0
 
     def _noise_takes_over(self, view: Windows, here: Here, lin: Linearisation) -> tuple[bool, float]:
         """Whether coloured noise would move theta farther from plain least squares than coloured noise itself could.
@@ -638,21 +644,28 @@ class SegmentSolver:
                 lengths = self._scaled(view, solved.precision, view.start_precision + diagonal)
                 scale = lengths, self._axes(view, here.theta, hessian, lengths)
                 if expected < tolerance:
-                    return _Trial(here.theta, starts, lin.residual, 0.0, expected, here.damping), scale
+                    return _Trial(here.theta, starts, lin.residual, 0.0, expected, 0.0, here.damping), scale
             thetas.append(theta)
             changes.append(solved.blocks(move))
         stacked, all_starts = np.stack(thetas), starts + np.stack(changes)
         best, residuals, values = best_step(view, stacked, all_starts, energy, now, 0.1 * tolerance)
         damping = float(here.damping * _DAMPINGS[best])
-        trial = _Trial(stacked[best], all_starts[best], residuals[best], now - float(values[best]), expected, damping)
+        gained = now - float(values[best])
+        trial = _Trial(stacked[best], all_starts[best], residuals[best], gained, expected, gained, damping)
         point, foretold = _Point(stacked[0], all_starts[0], residuals[0], float(values[0])), now - expected
-        short = trial.gained < 0.75 * expected and np.isfinite(values[0]) and not self._beginnings
+        short = gained < 0.75 * expected and np.isfinite(values[0]) and not self._beginnings
         for _ in range(self.tuning.corrections if short else 0):
-            before, point = point, self._corrected(view, here, lin, energy, point)
-            if point.energy - foretold > 0.6 * (before.energy - foretold):
+            before = point
+            try:
+                point = self._corrected(view, here, lin, energy, point)
+            except BudgetExhausted:
+                self.windows.short = True
                 break
             if now - point.energy > trial.gained + 0.1 * tolerance:
-                trial = _Trial(*point[:3], now - point.energy, expected, float(here.damping * _DAMPINGS[0]))
+                damping = float(here.damping * _DAMPINGS[0])
+                trial = _Trial(*point[:3], now - point.energy, expected, gained, damping)
+            if point.energy - foretold > 0.6 * (before.energy - foretold):
+                break
         return trial, scale
 
     def _corrected(self, view: Windows, here: Here, lin: Linearisation, energy: WindowEnergy, at: _Point) -> _Point:
@@ -813,7 +826,7 @@ class SegmentSolver:
         return replace(state, points=points, point=len(state.points), here=here, elsewhere=True)
 
     def _is_worth_looking(self, state: SolverState) -> bool:
-        """Whether another optimum is worth looking for: with restarts left, and where none led back to another."""
+        """Whether another optimum is worth looking for: with restarts left, unless one led back to another."""
         options, ends, windows = self.problem.options, [one for one in state.optima if not one.early], self.windows
         most = self.tuning.most_points if windows.starts_measured or windows.rates_measured else options.restarts
         asked = options.restarts > 1 and options.initial is None and len(state.points) < most
@@ -828,7 +841,7 @@ class SegmentSolver:
         with windows.counting(view):
             residual, valid = view.residuals(optimum.theta[None], view.no_starts(1))
         left = present_noise(view, residual[0])
-        return bool(valid[0] and 2.0 * np.log(optimum.sd / left.sd).mean() > np.log(self.tuning.silent))
+        return bool(valid[0] and self._share_left(optimum.sd, left.sd) > self.tuning.silent)
 
     def _find_elsewhere(self, state: SolverState) -> FloatArray | None:
         """Where plain least squares fit as well as at the optima, theta (N,); None if nowhere.
@@ -841,7 +854,7 @@ class SegmentSolver:
         better = poor and not self.windows.num_start  # then the last optimum need be none of plain least squares
         points = self._pick_drawn(state) if poor else []
         if not self._tells(last):
-            return next(iter(points), None)
+            return next(iter(points), None) if len(state.points) < self.problem.options.restarts else None
         points += self._pick_far(last.theta, np.diag(last.covariance) < 0.1**2)  # of others the log says little
         few = self._take_few((6 * len(points) + 2 * len(optima)) * (n + 3))  # most take six steps, from an optimum two
         for view in (few, self._view(0)[1]):
@@ -849,7 +862,8 @@ class SegmentSolver:
                 return None
             ends = self._follow(view, optima, points)
             points = [end.theta for end in ends[0 if better else len(optima) :]]
-        return next((point for point in points if self._is_as_good(view, ends[0].theta, point, better)), None)
+        known = last.theta if better else ends[0].theta
+        return next((point for point in points if self._is_as_good(view, known, point, better)), None)
 
     def _follow(self, view: Windows, optima: list[FloatArray], points: list[FloatArray]) -> list[_End]:
         """Ends of plain fits from the optima; then of those from the points that end elsewhere and fit as well."""
@@ -891,7 +905,7 @@ class SegmentSolver:
         room = 0.05 * windows.rollouts / len(windows.trajectories) * windows.num_windows / max(thetas, 1)
         count = min(max(int(room), 2), len(self._view(0)[0]))
         few = windows.part(((np.arange(count) + 0.5) * windows.num_windows / count).astype(int))
-        return few.beginnings(windows.telling_steps(math.ceil((Segments.window or 0.0) / float(few.dt.min()))))
+        return few.beginnings(few.telling_steps(math.ceil((Segments.window or 0.0) / float(few.dt.min()))))
 
     def _descend(self, view: Windows, theta: FloatArray, known: list[_End]) -> _End | None:
         """Where plain least squares end from theta (N,); None where that is near a known end or fits worse than it."""

@@ -92,10 +92,6 @@ class SearchProblem:
     find: Callable[[Finding], None]
     tell: Callable[[str, int], None] = lambda what, rollouts: None
 
-    def within(self, initial: FloatArray) -> Self:
-        """The same problem from other starting points (R, N), a part of a search that notes no findings."""
-        return replace(self, options=replace(self.options, initial=initial), find=lambda _: None)
-
     @cached_property
     def quadratic_prior(self) -> QuadraticPrior:
         """The prior's normal, before truncation."""

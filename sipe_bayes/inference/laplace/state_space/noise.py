@@ -181,7 +181,7 @@ def first_noise(chain: Chain, linear: ChainLinearisation, movement: FloatArray, 
     """
     jumps, fixed = jump_scale(linear), chain.fixed_sd
     least_sd, least_process = chain.least
-    measured = chain.determined.all() and chain.settings.starts == "estimated"
+    measured = chain.determined.all()
     direct = np.array([np.inf if c is None or not measured else jumps[c] / 3 for c in chain.coordinates])
     sd = np.where(np.isnan(fixed), np.maximum(np.minimum(roughness(chain), direct), least_sd), fixed)
     return ChainNoise(sd, np.maximum(jumps if measured else tuning.free_share * movement, least_process))

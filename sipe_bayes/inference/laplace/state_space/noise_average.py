@@ -56,17 +56,18 @@ def averaged(problem: SearchProblem, chain: Chain, fit: ChainFit) -> FloatArray:
     average, logs = tuning.noise_average, of_noise.start[of_noise.free]
     axes, rng = _axes(of_noise, logs, average), np.random.default_rng([problem.seed, 2])
     here, solved = at(logs)
-    beside, means, covariances = normal(solved), [], []
+    beside, means, covariances, taken = normal(solved), [], [], 0
     for draw in range(average.draws):
         proposed = logs + average.step * rng.standard_normal() * axes[draw % len(axes)]
         value, solved = at(proposed)
         if np.log(rng.random()) < value - here:
-            logs, here, beside = proposed, value, normal(solved)
+            logs, here, beside, taken = proposed, value, normal(solved), taken + 1
         means.append(beside[0])
         covariances.append(beside[1])
         if (draw + 1) % (average.draws // 8) == 0:
-            scatter = np.log([np.diag(one) for one in covariances]).std(0).max() / 2
-            if scatter * np.sqrt(2 * len(axes) / (draw + 1)) < average.exact:
+            sds = np.sqrt([np.diag(one) for one in covariances])
+            scatter = max(np.log(sds).std(0).max(), (np.std(means, axis=0) / sds[-1]).max())
+            if taken > len(axes) and scatter * np.sqrt(2 * len(axes) / (draw + 1)) < average.exact:
                 break
     return _spread(means, covariances)
 

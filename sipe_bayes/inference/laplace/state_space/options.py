@@ -1,4 +1,4 @@
-"""Tuning of the searches over a chain of states, each number with its reason."""
+"""Tuning of the search over a chain of states, each number with its reason."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class WideTuning:
 
 
 class ChainTuning:
-    """Numbers of the searches over a chain of states."""
+    """Numbers of the search over a chain of states."""
 
     damping: ClassVar[DampingRule] = DampingRule()  # how steps are damped
     noise: ClassVar[NoiseTuning] = NoiseTuning()  # how noise is guessed and estimated

@@ -92,7 +92,7 @@ class StateSpaceSearch(WideSearch):
         }
 
     def _linearised(self, here: Position) -> ChainLinearisation | None:
-        """By short differences until there is an optimum, by theta alone for the regression."""
+        """By short differences at first, by theta alone for the regression."""
         if here.phase is Phase.REGRESS:
             return linearise(self.chain, here.theta, here.states, with_states=False)
         return super()._linearised(here)
@@ -167,7 +167,8 @@ class StateSpaceSearch(WideSearch):
         if state.here.is_wide:
             return self.wide_smooth(state, linear)
         if state.here.damping > self.tuning.smoothing.blind:
-            return self._widened(state, blind=True)
+            ahead = self._widened(state, blind=True)
+            return ahead if state.recorded is not None else self._widen(ahead, linear)
         tuning, here = self.tuning.smoothing, replace(state.here, iteration=state.here.iteration + 1)
         here = replace(here, steps=here.steps + 1)
         prior, tolerance = self.problem.quadratic_prior, tuning.tolerance

@@ -26,7 +26,7 @@ from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, 
 
 
 class Phase(StrEnum):
-    """What the next step of a search does; each search has a function for each of its phases."""
+    """What the next step of the search does."""
 
     REGRESS = auto()
     """Theta by regression on the measured states."""
@@ -37,7 +37,7 @@ class Phase(StrEnum):
     NOISE = auto()
     """The noise is estimated anew before the step."""
     WIDEN = auto()
-    """From an optimum by short differences on with wide ones."""
+    """On with wide differences."""
 
 
 @dataclass(frozen=True)
@@ -318,7 +318,7 @@ def optimum_at(
     value: float,
     settled: bool,
 ) -> ChainOptimum:
-    """The optimum at its linearisation by short differences, its normal about the best step from there.
+    """The optimum at its linearisation, its normal about the best step from there.
 
     value: the evidence; settled: whether the noise has.
     """
