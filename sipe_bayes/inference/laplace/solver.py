@@ -13,8 +13,8 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
 2. FIT: theta and the initial states, noise by restricted likelihood before each step; on the same part, then on
    ``whole`` times as many segments. Columns of the initial states are kept while they predict what a step gains. Where
    a step gains less than three quarters of what it promised, further ones by the same linearisation lead back into a
-   curved valley. At the first step where initial states do not explain nearly all residuals, plain
-   is held against generalised least squares (``_noise_takes_over``).
+   curved valley. The first step holds plain against generalised least squares (``_noise_takes_over``), unless initial
+   states explain nearly all that plain ones leave.
 3. COMPARE: the plain fit and the posterior mode each run free along the whole training logs. Where the mode is worse by
    more than 3 %, coloured noise explains what parameters should.
 
@@ -509,8 +509,9 @@ class SegmentSolver:
                 here = replace(here, starts=self.windows.no_starts(), residual=None)
                 lin, fresh, scale = self._linearised(view, replace(here, starts_jacobian=None), here.starts[keep])
             compares = self.tuning.compares and len(state.plain) and not (state.compared or here.white)
-            if compares and not self._starts_explain(view, here, lin):
-                takes_over, wider = self._noise_takes_over(view, here, lin)
+            if compares:
+                held = self._starts_explain(view, here, lin)
+                takes_over, wider = (False, 1.0) if held else self._noise_takes_over(view, here, lin)
                 here, state = replace(here, white=takes_over), replace(state, compared=True, wider=wider)
                 if takes_over and self.windows.rates_measured:
                     return replace(state, here=self._begin_fit(state, state.plain, plain=True))
@@ -564,14 +565,14 @@ class SegmentSolver:
         return replace(here, part=self._last(Stage.PLAIN, white=True), enough=enough)
 
     def _starts_explain(self, view: Windows, here: Here, lin: Linearisation) -> bool:
-        """Whether initial states explain nearly all that plain least squares leave: they come first then.
+        """Whether initial states explain nearly all that plain least squares leave, which then have no last word.
 
         Residuals that a smoothed velocity leaves are lines in time, which coloured noise would explain as well.
         """
         plain, moments = present_noise(view, lin.residual), view.moments(lin, white=True)
         starts = here.starts[self._view(here.part)[0]]
         left = updated_noise(view, moments, plain, here.theta, starts, self.prior, coloured=False)
-        return self._share_left(left.sd, plain.sd) < self.tuning.silent
+        return self._share_left(left.sd, plain.sd) < self.tuning.explained
 
     def _share_left(self, sd: FloatArray, plain: FloatArray) -> float:
         """Of squares, by sds (C,) over the ``plain`` ones; one where all are given."""
