@@ -520,7 +520,7 @@ class SegmentSolver:
                 noise = present_noise(view, lin.residual)
             if not here.enough:
                 noise = updated_noise(view, moments, noise, here.theta, here.starts[keep], self.prior, not here.white)
-                tolerance = self.tuning.tolerance * max(view.num_theta, 1) * (state.wider if here.white else 1.0)
+                tolerance = self.tuning.tolerance * max(view.num_theta, 1)
                 trial, lengths = self._tried(view, here, lin, moments, noise, here.starts[keep], tolerance)
         if here.enough:
             return self._ended(state, replace(here, noise=noise), lin, moments, keep, view, True)
