@@ -118,7 +118,7 @@ def test_every_fit_has_a_seed_of_its_own(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_fetch_is_checked_from_its_recorded_start() -> None:
     """Its controller has a memory, which StateSpace does not look for in measurements."""
-    given = {"steps": 4, "noise": 0.01, "budget": 300, "refits": 0, "seed": 0, "threads": 1}
+    given = {"steps": 4, "noise": 0.01, "budget": 1500, "refits": 0, "seed": 0, "threads": 1}
     for task, starts in (("FetchPush", "recorded"), ("Pendulum", "estimated")):
         study = study_of_task(task, "laplace", **given)  # type: ignore[arg-type]
         assert isinstance(study.estimator.likelihood, StateSpace)

@@ -12,7 +12,7 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
    that gain about the same the shortest is taken: what a log leaves open stays near the model as given.
 2. FIT: theta and the initial states, noise by restricted likelihood before each step; on the same part, then on
    ``whole`` times as many segments. Columns of the initial states are kept while they predict what a step gains. Where
-   a step gains less than three quarters of what it promised, further ones by the same linearisation lead back into a
+   one after the tenth step gains less than three quarters of what it promised, further ones by the same linearisation lead back into a
    curved valley. The first step holds plain against generalised least squares (``_noise_takes_over``), unless initial
    states explain nearly all that plain ones leave.
 3. COMPARE: the plain fit and the posterior mode each run free along the whole training logs. Where the mode is worse by
@@ -654,7 +654,7 @@ class SegmentSolver:
         gained = now - float(values[best])
         trial = _Trial(stacked[best], all_starts[best], residuals[best], gained, expected, gained, damping)
         point, foretold = _Point(stacked[0], all_starts[0], residuals[0], float(values[0])), now - expected
-        short = gained < 0.75 * expected and np.isfinite(values[0]) and not self._beginnings
+        short = gained < 0.75 * expected and np.isfinite(values[0]) and not self._beginnings and here.iteration >= 10
         for _ in range(self.tuning.corrections if short else 0):
             before = point
             try:
