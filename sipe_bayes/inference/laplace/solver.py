@@ -244,7 +244,8 @@ class SegmentSolver:
         self._views = {}
         if state.elsewhere:
             settled = tuple(one for one in state.optima if not one.early)
-            if any(is_back(state.here.theta, state.points[state.point], one) for one in settled):
+            begin, theta = state.points[state.point], state.here.theta
+            if any(is_back(theta, begin, one.mean, np.linalg.inv(one.covariance)) for one in settled):
                 return replace(state, optima=settled, done=True)
         stages = {Stage.PLAIN: self._plain, Stage.FIT: self._fit, Stage.COMPARE: self._compare}
         return stages[state.here.stage](state)
@@ -253,7 +254,7 @@ class SegmentSolver:
         windows = self.windows
         fixed = windows.fixed_sd
         sd = np.where(np.isnan(fixed), np.maximum(0.1 * windows.spread, windows.rounding), fixed)
-        stage = Stage.PLAIN if windows.starts_measured or windows.rates_measured else Stage.FIT
+        stage = Stage.PLAIN if self._may_begin_plain else Stage.FIT
         noise = Noise(sd, np.zeros(len(sd)))
         white = windows.settings.noise != "ar1"
         return Here(stage, 0, theta, windows.no_starts(), noise, self.tuning.damping, white=white)
@@ -276,6 +277,11 @@ class SegmentSolver:
 
     # Parts of the segments
 
+    @property
+    def _may_begin_plain(self) -> bool:
+        """Whether initial states are measured, so that plain least squares tell something."""
+        return self.windows.starts_measured or self.windows.rates_measured
+
     @cached_property
     def _beginnings(self) -> list[int]:
         """Control steps of the segments' beginnings that are fitted before the whole: ever more through impacts."""
@@ -290,7 +296,11 @@ class SegmentSolver:
             return math.inf
         columns = windows.num_theta + windows.num_start + 1
         sizes = (*(0.25 for _ in self._beginnings), 0.25, 1.0, self.tuning.whole)
-        return float(self.tuning.linearised_steps / columns * sizes[part] / windows.physics_steps)
+        share = float(self.tuning.linearised_steps / columns / windows.physics_steps)
+        if part == len(self._beginnings) and self._may_begin_plain:  # a quarter even of what is little
+            least = self.tuning.least_samples * windows.num_theta / max(int(windows.observed.sum()), 1)
+            return min(sizes[part] * share, max(sizes[part], least))
+        return sizes[part] * share
 
     def _view(self, part: int) -> tuple[IntArray, Windows]:
         """Numbers (K,) of the segments of a part, and these or their beginnings."""
@@ -300,10 +310,16 @@ class SegmentSolver:
             if share < 1:
                 keep = spread_segments(windows.log, share)
                 windows = windows.part(keep)
+                if part == len(self._beginnings) and (longer := share * self.windows.num_windows / len(keep)) < 1:
+                    windows = windows.beginnings(self._least_steps(windows, int(longer * windows.steps.max())))
             if part < len(self._beginnings):
                 windows = windows.beginnings(self._beginnings[part])
             self._views[part] = keep, windows
         return self._views[part]
+
+    def _least_steps(self, windows: Windows, steps: int = 1) -> int:
+        """Control steps, at least so many, of a beginning that tells as much as a segment of the default length."""
+        return windows.telling_steps(max(steps, math.ceil((Segments.window or 0.0) / float(windows.dt.min()))))
 
     def count_segments(self) -> int:
         """How many segments the fit uses in the end."""
@@ -405,7 +421,9 @@ class SegmentSolver:
         if not step.lin.valid:  # diverges on what the part before did not hold
             return replace(state, here=replace(here, stage=Stage.FIT, residual=None, starts_jacobian=None))
         after, more = step.after, self._next_part(Stage.PLAIN, here.part, here.enough > 0)
-        enough = self._plain_enough(view, here, step.lin.residual) * (10.0 if here.part == 0 and more else 1.0)
+        enough = self._plain_enough(view, here, step.lin.residual)
+        if here.part == 0 and more:
+            enough = min(10.0 * enough, max(0.05 * view.observed.sum(), enough))
         if not step.ends(enough, foretold=not here.enough) and after.iteration < self.tuning.most_steps:
             return replace(state, here=after)
         if here.part == 0 and self._beginnings and len(state.ends) < len(state.points):
@@ -829,14 +847,14 @@ class SegmentSolver:
     def _is_worth_looking(self, state: SolverState) -> bool:
         """Whether another optimum is worth looking for: with restarts left, unless one led back to another."""
         options, ends, windows = self.problem.options, [one for one in state.optima if not one.early], self.windows
-        most = self.tuning.most_points if windows.starts_measured or windows.rates_measured else options.restarts
+        most = self.tuning.most_points if self._may_begin_plain else options.restarts
         asked = options.restarts > 1 and options.initial is None and len(state.points) < most
         return asked and not self._beginnings and not any(one.holds(ends[-1]) for one in ends[:-1])
 
     def _tells(self, optimum: WindowOptimum) -> bool:
         """Whether a plain fit tells anything: measured initial states leave little beside an optimum's noise."""
         windows = self.windows
-        if not (windows.starts_measured or windows.rates_measured):
+        if not self._may_begin_plain:
             return False
         view = self._take_few(1)
         with windows.counting(view):
@@ -896,7 +914,7 @@ class SegmentSolver:
         return [one for one in best if (one != theta).any()][: options.restarts - 1]
 
     def _take_few(self, thetas: int) -> Windows:
-        """So few segments that simulations of ``thetas`` take a twentieth of what the fit took, mostly less; or two.
+        """So few segments that simulations of ``thetas`` take a twentieth of what the fit took, mostly less; or one.
 
         Of longer ones as much as a segment holds by default.
         """
@@ -904,13 +922,13 @@ class SegmentSolver:
         if not windows.has_parts:
             return windows
         room = 0.05 * windows.rollouts / len(windows.trajectories) * windows.num_windows / max(thetas, 1)
-        count = min(max(int(room), 2), len(self._view(0)[0]))
+        count = min(max(int(room), 1), len(self._view(0)[0]))
         few = windows.part(((np.arange(count) + 0.5) * windows.num_windows / count).astype(int))
-        return few.beginnings(few.telling_steps(math.ceil((Segments.window or 0.0) / float(few.dt.min()))))
+        return few.beginnings(self._least_steps(few))
 
     def _descend(self, view: Windows, theta: FloatArray, known: list[_End]) -> _End | None:
         """Where plain least squares end from theta (N,); None where that is near a known end or fits worse than it."""
-        here, n, worst = self._begin(theta), len(theta), np.inf
+        here, worst = self._begin(theta), np.inf
         if known:  # residuals larger by a tenth: initial states as measured leave some of that
             worst = min(end.energy for end in known) + 0.1 * view.observed.sum()
         for left in range(7, -1, -1):  # eight steps: two more than most take
@@ -918,8 +936,8 @@ class SegmentSolver:
             here = step.after
             assert here.residual is not None
             energy = self._profile(view, here.residual) + self.prior.energy(here.theta)
-            if any((here.theta - end.theta) @ end.hessian @ (here.theta - end.theta) < 4 * n for end in known):
-                return None  # within two sds, on its way to that end
+            if any(is_back(here.theta, theta, end.theta, end.hessian) for end in known):
+                return None
             if left < 6 and energy - left * max(step.gained, 0.0) > worst:
                 return None  # at this pace it does not get there
             if step.ends(self._plain_enough(view, here, step.lin.residual), foretold=False):
@@ -953,13 +971,13 @@ class SegmentSolver:
         return bool(valid.all() and other - first > 10.0 * (state.wider if here.white else 1.0))
 
 
-def is_back(theta: FloatArray, begin: FloatArray, optimum: WindowOptimum) -> bool:
-    """Whether a fit that began at a point (N,) has come, at theta (N,), to an optimum that is known.
+def is_back(theta: FloatArray, begin: FloatArray, optimum: FloatArray, precision: FloatArray) -> bool:
+    """Whether a fit that began at a point (N,) has come, at theta (N,), to a known optimum (N,) of precision (N, N).
 
-    In each principal direction of its normal within one sd, or within a tenth of the way that it had to come.
+    In each principal direction within one sd, or within a tenth of the way that it had to come.
     """
-    eigenvalues, axes = np.linalg.eigh(optimum.covariance)
-    left, whole = (np.abs((point - optimum.mean) @ axes) / np.sqrt(eigenvalues) for point in (theta, begin))
+    eigenvalues, axes = np.linalg.eigh(precision)
+    left, whole = (np.abs((point - optimum) @ axes) * np.sqrt(np.maximum(eigenvalues, 0)) for point in (theta, begin))
     return bool((left < np.maximum(1.0, 0.1 * whole)).all())
 
 
