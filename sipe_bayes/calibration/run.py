@@ -225,7 +225,7 @@ def _described(
         noise=noise,
         mixing=mixing,
         logs=guard.run("samples left out of each log", lambda: with_wild(problem, method)).otherwise(first.logs),
-        checked=True,
+        checked=not guard.is_late,
     )
     noticed = guard.gather(_looks(problem, method, marginals, answers, result))
     return replace(result, findings=(*noticed, *guard.findings))

@@ -251,6 +251,11 @@ class Guard:
         return [item for name, look in looks.items() for item in self.run(name, look).otherwise(())]
 
     @property
+    def is_late(self) -> bool:
+        """Whether the deadline has cost a step."""
+        return bool(self._late)
+
+    @property
     def findings(self) -> tuple[Finding, ...]:
         """Diagnostics of the steps that have no result."""
         skipped = {"the time limit had passed": self._late, "each needs one that has no result": self._dependent}

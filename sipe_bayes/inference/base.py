@@ -28,7 +28,7 @@ from sipe_bayes.core.options import Options
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import MOST_ROLLOUTS, flag, path, whole
 from sipe_bayes.inference.recorded import Progress, Recorded, at_bounds, digest, silent
-from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall
+from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, Deadline
 
 if TYPE_CHECKING:
     from sipe_bayes.likelihood import BoundLikelihood, BoundStates, FitResult, Segments, StateSpace
@@ -168,6 +168,7 @@ class Estimator(ABC, Generic[S]):
         self._last: Snapshot[S] | None = None
         self._run = ""  # fingerprint of the run that it belongs to
         self._bound: tuple[Trajectories, BoundLikelihood | BoundStates] | None = None
+        self._deadline = Deadline()
         self._given = Given()
         self._observed: Trajectory | None = None
         self.prepare()
@@ -220,7 +221,7 @@ class Estimator(ABC, Generic[S]):
             BudgetTooSmall: for a budget without an estimate.
             CheckpointError: for a checkpoint that is damaged or of another run.
         """
-        batch, ends = self._given.stack(self._recorded(trajectories), anew=True), time.monotonic() + self.time_limit
+        batch, deadline = self._given.stack(self._recorded(trajectories), anew=True), self._set_deadline()
         self.choose_likelihood(batch)
         self.budget = self.budget_for(batch) if self._own_budget else self.budget
         fingerprint = self._fingerprint(batch)
@@ -234,15 +235,14 @@ class Estimator(ABC, Generic[S]):
         try:
             while not last.state.done:
                 last = self._keep(self.step(last.state, batch))
-                stored.offer(last, last.state.done, self._bound is not None and self._bound[1].short)
+                stored.offer(last, last.state.done, self._is_short)
                 self.tell(self.describe(last.state), self.rollouts)
-                if time.monotonic() > ends and not last.state.done:
+                if deadline.hit or (time.monotonic() > deadline.ends and not last.state.done):
                     with suppress(BudgetTooSmall):  # there is no estimate yet
-                        posterior = self._finished(last.state, batch)
-                        stored.write()
-                        self.find(Code.TIME_LIMIT, seconds=self.time_limit)
-                        return posterior
+                        return self._ended_early(last.state, batch, stored)
         except BudgetExhausted:
+            if deadline.hit:
+                return self._ended_early(last.state, batch, stored)
             stored.write()
             self.find(Code.BUDGET_SPENT, budget=self.budget)
         except BaseException:  # whatever interrupts it; an earlier checkpoint outlives a failure in the first step
@@ -250,7 +250,28 @@ class Estimator(ABC, Generic[S]):
                 with suppress(OSError):
                     stored.write()
             raise
+        self._set_deadline(math.inf)
         return self._finished(last.state, batch)
+
+    def _set_deadline(self, seconds: float | None = None) -> Deadline:
+        """A time from now, by default ``time_limit``, after which nothing is simulated."""
+        self._deadline = Deadline(time.monotonic() + (self.time_limit if seconds is None else seconds))
+        if self._bound is not None:
+            self._bound[1].deadline = self._deadline
+        return self._deadline
+
+    @property
+    def _is_short(self) -> bool:
+        """Whether there would have been more with a larger budget or more time."""
+        return self._deadline.hit or (self._bound is not None and self._bound[1].short)
+
+    def _ended_early(self, state: S, batch: Trajectories, stored: Stored[Snapshot[S]]) -> Posterior:
+        """The posterior when the time limit has passed."""
+        self._set_deadline(math.inf)
+        posterior = self._finished(state, batch)
+        stored.write()
+        self.find(Code.TIME_LIMIT, seconds=self.time_limit)
+        return posterior
 
     def tell(self, what: str, rollouts: int) -> None:
         """Progress, where it is wanted."""

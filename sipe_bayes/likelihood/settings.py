@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Real
@@ -20,6 +21,19 @@ if TYPE_CHECKING:
 
 class BudgetExhausted(RuntimeError):
     """Raised instead of simulating beyond the budget."""
+
+
+class Deadline:
+    """A time on the monotonic clock after which nothing is simulated; ``hit`` once a simulation was refused."""
+
+    def __init__(self, ends: float = math.inf) -> None:
+        self.ends, self.hit = ends, False
+
+    def check(self) -> None:
+        """Raise BudgetExhausted where the time has passed."""
+        if time.monotonic() > self.ends:
+            self.hit = True
+            raise BudgetExhausted("the time limit has passed")
 
 
 class BudgetTooSmall(ValueError):

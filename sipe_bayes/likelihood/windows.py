@@ -33,7 +33,7 @@ from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_level, noise_scales, pooled, whiten
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise, marginal
 from sipe_bayes.likelihood.sequences import Sequence, compared_samples, reached, sequences, spread_blocks
-from sipe_bayes.likelihood.settings import BudgetExhausted, Segments, chosen_channels, fitted_rotations
+from sipe_bayes.likelihood.settings import BudgetExhausted, Deadline, Segments, chosen_channels, fitted_rotations
 from sipe_bayes.likelihood.starts.estimates import (
     STATE_STEP,
     all_starts_measured,
@@ -83,6 +83,7 @@ class Windows:
     sequences: list[Sequence]
     lead: IntArray
     begin: IntArray
+    deadline = Deadline()  # of a fit; never by default
     _masked = 0
     _unmasked: BoolArray
 
@@ -401,7 +402,8 @@ class Windows:
         return prompt(self.simulator, contacts), prompt(self.simulator.on_processor, contacts)
 
     def spend(self, batch: int) -> None:
-        """Count the rollouts of ``batch`` thetas; raises BudgetExhausted where there are too few left."""
+        """Count the rollouts of ``batch`` thetas; raises BudgetExhausted where too few or too little time are left."""
+        self.deadline.check()
         cost = batch * len(self.trajectories)
         if self.rollouts + cost > self.budget:
             raise BudgetExhausted(f"{self.rollouts} of {self.budget:g} rollouts used, the next step takes {cost}")

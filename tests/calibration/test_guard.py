@@ -193,6 +193,7 @@ def test_a_time_limit_ends_with_the_best_estimate(
     undisturbed = run(config, out=tmp_path / "whole", **settings)
     early = run(config, out=tmp_path / "out", time_limit=1e-9, **settings)
     assert early.rollouts < undisturbed.rollouts
+    assert (early.checked, undisturbed.checked) == (False, True)
     assert len(early.parameters) == 2
     findings = Findings(early.findings)
     assert "1e-09 s" in findings.of(Code.TIME_LIMIT)[0].text

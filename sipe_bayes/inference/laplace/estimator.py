@@ -31,7 +31,7 @@ from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, ChainSt
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
 from sipe_bayes.inference.laplace.target import Target, WindowFit, WindowTarget
-from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, FitResult, Noise, StateSpace
+from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, Deadline, FitResult, Noise, StateSpace
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.starts.estimates import contacts_of
 from sipe_bayes.likelihood.state_space.chain import Chain
@@ -128,6 +128,7 @@ class Laplace(Estimator[LaplaceState]):
     def step(self, state: LaplaceState, trajectories: Trajectories) -> LaplaceState:
         """A step of the search, or, where it has ended, one more batch of draws."""
         windows = self.bound(trajectories)
+        windows.deadline = self._deadline if state.search.optima else Deadline()  # not before there is an estimate
         if state.draws is not None and isinstance(windows, Windows):
             assert isinstance(state.search, WindowState)
             windows.mask(state.search.wild)

@@ -846,7 +846,7 @@ class SegmentSolver:
 
     def _is_worth_looking(self, state: SolverState) -> bool:
         """Whether another optimum is worth looking for: with restarts left, unless one led back to another."""
-        options, ends, windows = self.problem.options, [one for one in state.optima if not one.early], self.windows
+        options, ends = self.problem.options, [one for one in state.optima if not one.early]
         most = self.tuning.most_points if self._may_begin_plain else options.restarts
         asked = options.restarts > 1 and options.initial is None and len(state.points) < most
         return asked and not self._beginnings and not any(one.holds(ends[-1]) for one in ends[:-1])
@@ -914,7 +914,7 @@ class SegmentSolver:
         return [one for one in best if (one != theta).any()][: options.restarts - 1]
 
     def _take_few(self, thetas: int) -> Windows:
-        """So few segments that simulations of ``thetas`` take a twentieth of what the fit took, mostly less; or one.
+        """So few segments that simulations of ``thetas`` take a twentieth of what the fit took, or one of two logs.
 
         Of longer ones as much as a segment holds by default.
         """
@@ -922,7 +922,7 @@ class SegmentSolver:
         if not windows.has_parts:
             return windows
         room = 0.05 * windows.rollouts / len(windows.trajectories) * windows.num_windows / max(thetas, 1)
-        count = min(max(int(room), 1), len(self._view(0)[0]))
+        count = min(max(int(room), min(2, len(windows.trajectories))), len(self._view(0)[0]))
         few = windows.part(((np.arange(count) + 0.5) * windows.num_windows / count).astype(int))
         return few.beginnings(self._least_steps(few))
 

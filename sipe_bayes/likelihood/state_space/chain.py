@@ -38,6 +38,7 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.noise import chosen_sd, noise_scales
 from sipe_bayes.likelihood.settings import (
     BudgetExhausted,
+    Deadline,
     StateSpace,
     check_prompt,
     check_seen,
@@ -67,6 +68,8 @@ class Chain:
         uncounted: part of a rollout, not counted yet.
         setup_rollouts: what placing the states took, which a search counts when it starts.
     """
+
+    deadline = Deadline()  # of a fit; never by default
 
     def __init__(self, settings: StateSpace, simulator: Simulator, trajectories: Trajectories) -> None:
         simulator = simulator.on_processor  # one-step differences are below float32's rounding
@@ -284,6 +287,7 @@ class Chain:
         return np.concatenate([states[:, : simulator.engine.physics_size], memory], axis=1)
 
     def _spend(self, cost: float) -> None:
+        self.deadline.check()
         cost += self.uncounted
         if self.rollouts + math.ceil(cost) > self.budget:
             raise BudgetExhausted(f"{self.rollouts} of {self.budget:g} rollouts used, the next step takes {cost:.0f}")
