@@ -12,8 +12,9 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.laplace.options import LaplaceTuning, SolverTuning
-from sipe_bayes.inference.laplace.solver import SegmentSolver, SolverState, spread_segments
-from sipe_bayes.likelihood import Segments, bind
+from sipe_bayes.inference.laplace.solver import SegmentSolver, SolverState, is_back, spread_segments
+from sipe_bayes.likelihood import BudgetExhausted, Deadline, Segments, StateSpace, bind
+from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.simulation.prompt import PromptSimulator, prompt
 from sipe_bayes.simulation.simulator import Simulator
 
@@ -142,6 +143,42 @@ def test_long_logs_are_fitted_in_part() -> None:
     assert fitted == pytest.approx(2 * 6000 / 7 / (4 * 50), abs=1)
     z = (posterior.mean.numpy() - TRUTH) / posterior.stddev.numpy()
     assert np.abs(z).max() < 4.5
+
+
+@pytest.mark.parametrize(("seconds", "window", "share"), [(80.0, 1.0, 0.25), (80.0, None, 0.25), (8.0, 1.0, 1.0)])
+def test_a_fit_begins_on_a_quarter_that_holds_enough_samples(seconds: float, window: float | None, share: float) -> None:
+    """Of several segments a quarter of them, of one its beginning; of 400 samples, 100 a parameter, all."""
+    method = Laplace(servo(), likelihood=Segments(window=window))
+    bound = bind(method.likelihood, method.simulator, method_logs(recorded(1, seconds)))
+    _, first = SegmentSolver(method.problem, bound)._view(0)
+    assert first.observed.sum() == pytest.approx(share * bound.observed.sum(), rel=0.05)
+
+
+def test_a_descent_is_back_where_it_is_in_every_direction() -> None:
+    """Within a tenth of its way along the precise direction, and within an sd along the other."""
+    optimum, precision, begin = np.zeros(2), np.diag([1e6, 1.0]), np.array([0.5, 0.5])
+    assert is_back(np.array([0.04, 0.5]), begin, optimum, precision)
+    assert not is_back(np.array([0.06, 0.5]), begin, optimum, precision)
+    assert not is_back(np.array([0.04, 1.2]), np.array([0.5, 5.0]), optimum, precision)
+
+
+@pytest.mark.parametrize("likelihood", [Segments(window=1.0), StateSpace()])
+def test_nothing_is_simulated_after_the_time_limit(likelihood: Segments | StateSpace) -> None:
+    """Not even within a step; and the end of the time is told apart from that of the budget."""
+    bound = bind(likelihood, servo(), method_logs(recorded(1, 2.0)))
+
+    def simulate() -> None:
+        if isinstance(bound, Chain):
+            bound.simulate(TRUTH[None], bound.reference[None])
+        else:
+            bound.predict(TRUTH[None], bound.no_starts(1))
+
+    simulate()
+    bound.deadline, before = Deadline(0.0), bound.rollouts
+    with pytest.raises(BudgetExhausted, match="time limit"):
+        simulate()
+    assert bound.deadline.hit
+    assert bound.rollouts == before
 
 
 def test_segments_are_spread_over_each_log() -> None:
