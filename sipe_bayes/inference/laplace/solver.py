@@ -245,7 +245,8 @@ class SegmentSolver:
         if state.elsewhere:
             settled = tuple(one for one in state.optima if not one.early)
             begin, theta = state.points[state.point], state.here.theta
-            if any(is_back(theta, begin, one.mean, np.linalg.inv(one.covariance)) for one in settled):
+            precisions = [np.asarray(np.linalg.inv(one.covariance), np.float64) for one in settled]
+            if any(is_back(theta, begin, one.mean, p) for one, p in zip(settled, precisions, strict=True)):
                 return replace(state, optima=settled, done=True)
         stages = {Stage.PLAIN: self._plain, Stage.FIT: self._fit, Stage.COMPARE: self._compare}
         return stages[state.here.stage](state)
@@ -423,7 +424,8 @@ class SegmentSolver:
         after, more = step.after, self._next_part(Stage.PLAIN, here.part, here.enough > 0)
         enough = self._plain_enough(view, here, step.lin.residual)
         if here.part == 0 and more:
-            enough = min(10.0 * enough, max(0.05 * view.observed.sum(), enough))
+            open_directions = np.linalg.eigvalsh(step.hessian)[0] < 1 / 0.1**2  # a part would lead astray along them
+            enough = np.inf if open_directions else max(0.2 * view.observed.sum(), enough)
         if not step.ends(enough, foretold=not here.enough) and after.iteration < self.tuning.most_steps:
             return replace(state, here=after)
         if here.part == 0 and self._beginnings and len(state.ends) < len(state.points):
