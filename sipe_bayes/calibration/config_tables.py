@@ -390,8 +390,8 @@ class Structure(Table):
     """joints, actuators, bodies and channels where extensions may be placed; default all"""
     budget: Budget | None = None
     """rollouts of all its fits; default 30,000"""
-    probability: Annotated[float, Strict(), Field(gt=0, le=1)] = 1.0
-    """of this model's structure among those that it tried, as `sipe discover` writes it into `discovered.toml`"""
+    weight: Annotated[float, Strict(), Field(gt=0, le=1)] = 1.0
+    """stacking weight of this structure among those that the logs do not tell apart, as `sipe discover` writes it"""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -97,8 +97,8 @@ def write_configuration(problem: Problem, structures: Structures, folder: Path, 
     data["parameters"] = [*data["parameters"], *_entries([p for one in placed for p in one.parameters])]
     space = _environment(structures).space
     values = zip(space.names, space.values(structures.best.theta).tolist(), strict=True)
-    probability = float(structures.probabilities.max())
-    data["structure"] = {**data.get("structure", {}), "probability": max(float(f"{probability:.3g}"), 1e-3)}
+    weight = structures.table()[0].weight
+    data["structure"] = {**data.get("structure", {}), "weight": max(float(f"{weight:.3g}"), 1e-3)}
     data["search"] = {**data.get("search", {}), "start": dict(values)}
     remarks = [f"{problem.config.path.name} with what `sipe discover` put in; run it from anywhere:"]
     remarks += [f"  sipe calibrate {folder / DISCOVERED_TOML}", *(x.sentence for x in structures.columns)]

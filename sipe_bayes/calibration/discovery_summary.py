@@ -38,6 +38,7 @@ from sipe_bayes.likelihood import BoundLikelihood, QuadraticPrior
 from sipe_bayes.posterior import Particles
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.structure.columns import corrected
+from sipe_bayes.structure.comparison import difference
 from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.state import Phase
@@ -48,11 +49,8 @@ _LARGER = 2  # times the budget that did not reach: what to try next
 _BEFORE = {
     Phase.COLUMNS: "any piece was tried",
     Phase.RANK: "what the model may lack was ranked",
-    Phase.STEPS: "shorter physics steps were tried",
-    Phase.FIT: "all pieces that promise something were fitted",
-    Phase.AGAIN: "the best piece was compared with the model without it",
-    Phase.PRUNE: "each kept piece was left out once",
-    Phase.SWAP: "what did about as well was tried in the place of what is kept",
+    Phase.FIT: "all extensions with a predicted gain were fitted",
+    Phase.PRUNE: "each extension of the best structure was left out once",
 }
 """What a search whose budget was spent did not come to, by what it was doing; the yardstick is no part of it."""
 
@@ -92,7 +90,6 @@ def summarise(
         parameters=tuple(averaged.summaries(_part(further, problem.prior.space))),
         plain_parameters=tuple(before.summaries(seed)),
         added=tuple(added),
-        cost=structures.search.cost,
         best=after.values,
         errors=tuple(compared),
         comparison=_comparison(problem, before, after),
@@ -128,9 +125,10 @@ def _untried(structures: Structures) -> str:
     """Pieces that a search whose budget was spent did not try, or not to the end, in words."""
     state, search = structures.state, structures.search
     if state.cut is Phase.FIT:
-        names = [search.placed[label].sentence for label in state.queue]
+        names = [search.placed[labels[-1]].sentence for labels in state.queue]
     elif state.cut in (Phase.COLUMNS, Phase.RANK):
-        names = [p.sentence for p in search.placed.values() if p.parameters and p.label not in state.present]
+        there = structures.best.labels
+        names = [p.sentence for p in search.placed.values() if p.parameters and p.label not in there]
     else:
         names = []
     if not names:
@@ -255,62 +253,31 @@ def _comparison(problem: Problem, before: _Model, after: _Model) -> Comparison |
 
 
 def _pieces(structures: Structures) -> tuple[Piece, ...]:
-    """The extensions with a name that were fitted, most probable first."""
+    """The extensions with a name that were fitted, those of the structure that is written out first."""
     pieces = []
-    for label, probability in structures.inclusion().items():
+    for label, weight in structures.inclusion().items():
         placed = structures.search.placed[label]
-        extension = placed.extension
+        extension, kept = placed.extension, label in structures.best.labels
         if extension.last_resort:
             continue
-        evidence, held_out = _gain(structures, label)
-        kept = label in structures.best.labels
-        paid = evidence is not None and evidence > structures.search.price(label)
-        log_score = _log_score(structures, label)
-        against = (held_out is not None and held_out <= 0) or (log_score is not None and log_score < 0)
+        gain, error = _gain(structures, label)
+        tied = any(label in one.labels for one in structures.supported[1:])
+        mjcf = extension.kind, extension.native, extension.nearest
+        names = tuple(p.name for p in placed.parameters)
         pieces.append(
             Piece(
-                label,
-                placed.sentence,
-                extension.reference,
-                probability,
-                evidence,
-                held_out,
-                log_score,
-                kept,
-                not kept and paid and against,
-                extension.kind,
-                extension.native,
-                extension.nearest,
-                tuple(p.name for p in placed.parameters),
+                label, placed.sentence, extension.reference, weight, gain, error, kept, tied and not kept, *mjcf, names
             )
         )
     return tuple(sorted(pieces, key=lambda piece: not piece.kept))
 
 
-def _gain(structures: Structures, label: str) -> tuple[float | None, float | None]:
-    """What an extension adds to the rest of the most probable structure that has it."""
-    having = [
-        (p, one.evidence, i)
-        for i, (p, one) in enumerate(zip(structures.probabilities.tolist(), structures.fitted, strict=True))
-        if label in one.labels
-    ]
-    one = structures.fitted[max(having)[2]]
+def _gain(structures: Structures, label: str) -> tuple[float, float] | tuple[None, None]:
+    """What an extension adds to the rest of the best structure that has it, and the standard error of that."""
+    having = [one for one in structures.fitted if label in one.labels]
+    one = max(having, key=lambda one: difference(one, structures.plain).nats)
     rest = structures.state.of([other for other in one.labels if other != label])
-    if rest is None:
-        return None, None
-    known = one.held_out is not None and rest.held_out is not None
-    held_out = one.held_out - rest.held_out if known else None  # type: ignore[operator]
-    return one.evidence - rest.evidence, held_out
-
-
-def _log_score(structures: Structures, label: str) -> float | None:
-    """What held-out logs gain by an extension beside the most of what was there when they were asked."""
-    state, gained = structures.state, None
-    for one in state.judged:
-        rest = state.judgement([other for other in one.labels if other != label])
-        if label in one.labels and rest is not None and one.log_score is not None and rest.log_score is not None:
-            gained = one.log_score - rest.log_score
-    return gained
+    return (None, None) if rest is None else difference(one, rest)
 
 
 def _added(structures: Structures, label: str, further: Particles | None, seed: int) -> list[ParameterSummary]:

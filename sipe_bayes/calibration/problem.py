@@ -142,14 +142,14 @@ def prepare(config: Config | str | Path, num_threads: int | None = None, device:
         Trajectories.stack(train),
         Trajectories.stack(held) if held else None,
         (*train_reports, *held_reports),
-        (*doubts, *remarks, *_of_structure(config.structure.probability)),
+        (*doubts, *remarks, *_of_structure(config.structure.weight)),
     )
 
 
-def _of_structure(probability: float) -> list[Finding]:
+def _of_structure(weight: float) -> list[Finding]:
     """That a search was not sure of the model's structure."""
-    sure = probability >= THRESHOLDS.sure_of_structure
-    return [] if sure else [finding(Code.STRUCTURE_UNCERTAIN, probability=probability)]
+    sure = weight >= THRESHOLDS.sure_of_structure
+    return [] if sure else [finding(Code.STRUCTURE_UNCERTAIN, weight=weight)]
 
 
 def _read(

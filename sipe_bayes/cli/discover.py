@@ -70,7 +70,7 @@ def discover(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
     threads: Annotated[int | None, typer.Option(help="Native threads; default all cores.")] = None,
 ) -> None:
-    """Physics that the model lacks: proposed, fitted, and kept where evidence and held-out pieces keep it."""
+    """Physics that the model lacks: proposed, fitted, and compared by what it predicts of pieces that were held out."""
     from sipe_bayes.calibration.discover import run_discovery
     from sipe_bayes.core.files import to_json
 
@@ -106,21 +106,21 @@ def lines_of(discovery: Discovery) -> list[str]:
     """What is printed above the answer."""
     from sipe_bayes.core.findings import singular
     from sipe_bayes.report.discovery.words import (
-        chance,
         error_line,
-        nats,
         structure_text,
         value_rows,
         warnings,
+        weight_text,
+        with_error,
     )
 
     of_columns = f" ({discovery.column_rollouts} for signs and units of columns)" if discovery.column_rollouts else ""
     effort = singular(f"{len(discovery.rows)} structures fitted, {discovery.rollouts} rollouts{of_columns}")
     effort += f", {discovery.seconds:.0f} s"
     lines = [f"{discovery.name}, what the model lacks: {effort}"]
-    tried = [f"{'nats over the model as it was':60}{'evidence':>9}{'held out':>9}{'probability':>12}"]
+    tried = [f"{'log predictive density in nats over the model as it was':60}{'gain':>18}{'weight':>9}"]
     for one in discovery.rows:
-        cells = f"{nats(one.evidence):>9}{nats(one.held_out):>9}{chance(one):>12}"
+        cells = f"{with_error(one.gain, one.error):>18}{weight_text(one):>9}"
         text = structure_text(one)
         text = text if len(text) <= _WIDTH else " + ".join(one.labels)  # cut off, several would read alike
         tried.append(f"  {text:{_WIDTH}.{_WIDTH}}{cells}")

@@ -336,8 +336,8 @@ class Code(Enum):
         "the earlier posterior has seen {logs} already: counted twice, the intervals come out too narrow"
     )
     STRUCTURE_UNCERTAIN = caution(
-        "the structure of this model has a probability of {probability:.2g} among those that `sipe discover` tried, "
-        "and the intervals hold where it is right: the values of its report are averaged over all of them"
+        "Other structures predict these logs as well: the one of this model has a stacking weight of {weight:.2g}. "
+        "Intervals hold if its structure is right. The report of `sipe discover` has intervals of all of them"
     )
     COMMAND_DOUBTED = caution(
         "column {column!r} {reason}, and is given as the command of {actuator!r}, which takes {drive}"

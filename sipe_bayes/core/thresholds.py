@@ -57,8 +57,8 @@ class Thresholds(Options):
 
     sure_of_structure: float = option(
         0.9,
-        "a structure that is less probable leaves out of a 90 % interval more than that interval does",
-        "probability",
+        "a structure with a smaller stacking weight leaves out of a 90 % interval more than that interval does",
+        "weight",
     )
 
     # logs and what the model lacks
@@ -86,13 +86,6 @@ class Thresholds(Options):
     )
     far_shift: float = option(
         1.0, "a parameter that would move further if the model had the cause is not to be trusted", "posterior sds"
-    )
-
-    open_structure: float = option(
-        0.01,
-        "a piece that the best structure does without is named beside it from this probability on: Laplace's method "
-        "tells evidence to a few nats, and a piece that acts nearly alike need not have lost",
-        "probability",
     )
 
     # predictions of held-out logs

@@ -20,13 +20,12 @@ class Piece:
         label: what tells it from others, as the table of structures has it.
         sentence: what it is.
         reference: where it is described.
-        probability: that the model lacks it, given the logs and what was tried.
-        evidence: nats that it adds to the rest of the most probable structure that has it; None where the rest was not
-            fitted.
-        held_out: nats of held-out pieces, likewise; None also where there are no pieces.
-        kept: whether the most probable structure has it.
-        log_score: nats that held-out logs gain by it in the round that it would have won; None where it was not asked.
-        undecided: whether it is out although its evidence pays for it, since held-out pieces or logs speak against it.
+        weight: sum of the stacking weights of the structures that have it.
+        gain: nats of log predictive density that it adds to the rest of the best structure that has it; None where the
+            rest was not fitted.
+        error: standard error of the gain.
+        kept: whether the structure that is written out has it.
+        tied: whether another structure of the set that the logs support has it.
         kind: what it is placed at: ``joint``, ``actuator``, ``channel`` (a measurement) or ``world``.
         native: whether MJCF has an element for it.
         nearest: the element that comes nearest where it has none.
@@ -36,12 +35,11 @@ class Piece:
     label: str
     sentence: str
     reference: str
-    probability: float
-    evidence: float | None
-    held_out: float | None
-    log_score: float | None
+    weight: float
+    gain: float | None
+    error: float | None
     kept: bool
-    undecided: bool
+    tied: bool
     kind: str
     native: bool
     nearest: str
@@ -78,9 +76,9 @@ class ModelErrors:
         unit: of the errors.
         given: of the model as given, from measured starts.
         before: of the plain model, calibrated, from measured starts.
-        after: of the most probable structure, from measured starts.
+        after: of the structure that is written out, from measured starts.
         fitted_before: of the plain model, calibrated, from the starts that fit it best.
-        fitted_after: of the most probable structure, from the starts that fit it best.
+        fitted_after: of the structure that is written out, from the starts that fit it best.
     """
 
     log: str
@@ -116,21 +114,20 @@ class Discovery:
     Args:
         name: of the run.
         columns: of the logs that have a wrong sign or unit, in words; everything below is of the logs set right.
-        rows: structures that were fitted, most probable first.
-        pieces: extensions that were fitted, most probable first.
+        rows: structures that were fitted, the set that the logs support first.
+        pieces: extensions that were fitted, those of the structure that is written out first.
         promises: what extensions promised at the plain model, best first.
-        posterior: of the user's parameters, averaged over structures.
+        posterior: of the user's parameters, stacked over the set that the logs support.
         prior: of them.
         parameters: that posterior by parameter.
         plain_parameters: the posterior under the plain model.
-        added: parameters of the most probable structure's extensions, averaged over the structures that have them.
-        cost: nats of evidence that an extension has to gain, since there were so many to choose from.
-        best: the optimum of the most probable structure, in units.
+        added: parameters of the written structure's extensions, stacked over the structures that have them.
+        best: the optimum of the structure that is written out, in units.
         errors: before and after, held-out logs first.
         comparison: of the held-out errors after with those before, from the starts that each model fits best; None
             without both.
         before: what the plain model leaves.
-        after: what the most probable structure leaves.
+        after: what the structure that is written out leaves.
         signals: of each log and channel; ``mode`` is the structure, ``default`` the plain model, calibrated.
         named_share: of what can be explained, what named pieces explain; None where that was not asked.
         settled: whether every fit that counts came to rest, and the budget was enough.
@@ -140,7 +137,7 @@ class Discovery:
         findings: what was noticed on the way.
         run: record of the run.
         out: folder of the results.
-        best_settled: whether the fit of the most probable structure came to rest.
+        best_settled: whether the fit of the structure that is written out came to rest.
     """
 
     name: str
@@ -153,7 +150,6 @@ class Discovery:
     parameters: tuple[ParameterSummary, ...]
     plain_parameters: tuple[ParameterSummary, ...]
     added: tuple[ParameterSummary, ...]
-    cost: float
     best: Mapping[str, float]
     errors: tuple[ModelErrors, ...]
     comparison: Comparison | None
@@ -172,12 +168,12 @@ class Discovery:
 
     @property
     def kept(self) -> tuple[Piece, ...]:
-        """The pieces of the most probable structure."""
+        """The pieces of the structure that is written out."""
         return tuple(piece for piece in self.pieces if piece.kept)
 
     @property
     def passes(self) -> bool:
-        """Whether what the most probable structure leaves passes for noise, or for something small beside it."""
+        """Whether what the structure that is written out leaves passes for noise, or for something small beside it."""
         return self.after.misfit is not None and not self.after.misfit.matters
 
     def to_dict(self) -> dict[str, object]:
@@ -191,7 +187,6 @@ class Discovery:
             "parameters": [asdict(p) for p in self.parameters],
             "plain_parameters": [asdict(p) for p in self.plain_parameters],
             "added": [asdict(p) for p in self.added],
-            "cost": self.cost,
             "best": dict(self.best),
             "errors": [asdict(row) for row in self.errors],
             "comparison": None if self.comparison is None else self.comparison.to_dict(),

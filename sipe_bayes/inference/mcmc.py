@@ -28,6 +28,7 @@ import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.budget import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.parameters import ParameterSpace
@@ -37,7 +38,7 @@ from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.laplace import Laplace, Target, TargetFit, noise_diagnostics, target_fit, target_of
-from sipe_bayes.likelihood import BoundLikelihood, BoundStates, BudgetExhausted, BudgetTooSmall, Segments, StateSpace
+from sipe_bayes.likelihood import BoundLikelihood, BoundStates, Segments, StateSpace
 from sipe_bayes.posterior import GaussianMixture, Particles
 from sipe_bayes.posterior.ensemble import mixing_of
 

@@ -48,6 +48,7 @@ import numpy as np
 import scipy.stats
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.budget import BudgetExhausted
 from sipe_bayes.core.findings import Code, Finding, Severity
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.seeding import torch_generator
@@ -58,7 +59,7 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.inverse_regression import Line
 from sipe_bayes.inference.log_noise import NOISE_BUDGET, fitted_noise, noise_is_unknown, process_noise
 from sipe_bayes.inference.recorded import Progress, Recorded
-from sipe_bayes.likelihood import FLAT_PRECISION, BudgetExhausted, Noise, QuadraticPrior, Replicas, observation_noise
+from sipe_bayes.likelihood import FLAT_PRECISION, Noise, QuadraticPrior, Replicas, observation_noise
 from sipe_bayes.posterior import GaussianMixture, Posterior
 
 

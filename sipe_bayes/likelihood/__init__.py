@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from sipe_bayes.likelihood.quadratic_prior import QuadraticPrior as QuadraticPrior
     from sipe_bayes.likelihood.replicas import Replicas as Replicas
     from sipe_bayes.likelihood.replicas import observation_noise as observation_noise
-    from sipe_bayes.likelihood.settings import BudgetExhausted as BudgetExhausted
-    from sipe_bayes.likelihood.settings import BudgetTooSmall as BudgetTooSmall
-    from sipe_bayes.likelihood.settings import Deadline as Deadline
     from sipe_bayes.likelihood.settings import Segments as Segments
     from sipe_bayes.likelihood.settings import StateSpace as StateSpace
     from sipe_bayes.likelihood.starts.estimates import estimate_states as estimate_states

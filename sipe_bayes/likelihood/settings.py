@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Real
@@ -17,27 +16,6 @@ from sipe_bayes.core.trajectory import Trajectories
 if TYPE_CHECKING:
     from sipe_bayes.simulation.callable_simulator import CallableSimulator
     from sipe_bayes.simulation.simulator import Simulator
-
-
-class BudgetExhausted(RuntimeError):
-    """Raised instead of simulating beyond the budget."""
-
-
-class Deadline:
-    """A time on the monotonic clock after which nothing is simulated; ``hit`` once a simulation was refused."""
-
-    def __init__(self, ends: float = math.inf) -> None:
-        self.ends, self.hit = ends, False
-
-    def check(self) -> None:
-        """Raise BudgetExhausted where the time has passed."""
-        if time.monotonic() > self.ends:
-            self.hit = True
-            raise BudgetExhausted("the time limit has passed")
-
-
-class BudgetTooSmall(ValueError):
-    """A budget that ran out before there was anything to estimate from."""
 
 
 def check_settings(starts: object, fit: object, noise_sd: object, zero: bool = True) -> None:

@@ -26,6 +26,7 @@ from typing import ClassVar
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
+from sipe_bayes.core.budget import BudgetExhausted, Deadline
 from sipe_bayes.core.rotations import nearest, written_near
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.block_tridiagonal import Eliminated
@@ -33,7 +34,7 @@ from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_level, noise_scales, pooled, whiten
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise, marginal
 from sipe_bayes.likelihood.sequences import Sequence, compared_samples, reached, sequences, spread_blocks
-from sipe_bayes.likelihood.settings import BudgetExhausted, Deadline, Segments, chosen_channels, fitted_rotations
+from sipe_bayes.likelihood.settings import Segments, chosen_channels, fitted_rotations
 from sipe_bayes.likelihood.starts.estimates import (
     STATE_STEP,
     all_starts_measured,

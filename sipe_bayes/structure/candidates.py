@@ -103,12 +103,6 @@ class _Fitted:
     noise: Noise
 
 
-def first(ranked: list[Candidate], width: int, tied: float) -> list[Candidate]:
-    """The first few, and those that promise as much as the first: a linear promise does not decide between them."""
-    level = (1 - tied) * ranked[0].gain if ranked else 0.0
-    return ranked[:width] + [c for c in ranked[width : 2 * width] if c.gain >= level]
-
-
 @dataclass(frozen=True)
 class _Around:
     """The logs linearised at an estimate."""

@@ -10,13 +10,12 @@ import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace import EVIDENCE_TUNING, Laplace
 from sipe_bayes.inference.recorded import Progress
-from sipe_bayes.likelihood import BoundLikelihood, BudgetTooSmall, FitResult, Noise, QuadraticPrior, Segments
+from sipe_bayes.likelihood import BoundLikelihood, FitResult, Noise, QuadraticPrior, Segments
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
@@ -24,7 +23,7 @@ from sipe_bayes.structure.candidates import promised
 from sipe_bayes.structure.columns import Column, corrected
 from sipe_bayes.structure.extension import Placed, extended
 from sipe_bayes.structure.physics_step import step_change
-from sipe_bayes.structure.scores import scores
+from sipe_bayes.structure.scores import Pieces, predictive, scores
 
 # structures differ by nats, and where friction has kinks the last ones come in ever smaller steps
 _STEPS = 40  # of a fit, which takes twenty to thirty
@@ -45,7 +44,7 @@ class FittedStructure:
         tau: (C,), its correlation time in seconds.
         starts: (W, D), of the windows.
         evidence: log p(y) in nats.
-        held_out: log score of held-out pieces in nats; None where there are no pieces.
+        held: pieces that were held out.
         rollouts: that the fit took.
         settled: whether the search had come to rest.
     """
@@ -58,7 +57,7 @@ class FittedStructure:
     tau: FloatArray
     starts: FloatArray
     evidence: float
-    held_out: float | None
+    held: Pieces
     rollouts: int
     settled: bool
 
@@ -144,10 +143,16 @@ class Fitting:
         simulator = self.simulator(placed)
         prior = self.prior_of(simulator)
         windows = self.windows(simulator)
-        left = max(budget - _scoring(windows), 1)
-        best, rollouts = self._optimum(simulator, prior, self.trajectories, initial, left, progress)
+        left = max(budget - self._scoring(windows), 1)
+        best, rollouts = self._optimum(simulator, prior, initial, left, progress)
         assert best.starts is not None
         both = scores(windows, best.theta, best.starts, best.noise, QuadraticPrior.of(prior))
+        pieces = both.pieces
+        if self.holdout is not None:
+            held = BoundLikelihood(self.likelihood, simulator, self.holdout)
+            posterior = GaussianMixture(torch.zeros(1), best.mean[None], best.covariance[None], simulator.space)
+            pieces = pieces.beside(predictive(held, best.theta, best.noise, QuadraticPrior.of(posterior)))
+            windows.rollouts += held.rollouts
         return FittedStructure(
             tuple(one.label for one in placed),
             best.theta,
@@ -157,10 +162,15 @@ class Fitting:
             best.noise.tau,
             best.starts,
             both.evidence,
-            both.held_out,
+            pieces,
             rollouts + windows.rollouts,
             best.finding is None,
         )
+
+    def _scoring(self, windows: BoundLikelihood) -> int:
+        """Rollouts that the scores of an optimum take."""
+        held = 0 if self.holdout is None else 2 * len(self.holdout)
+        return (windows.num_theta + windows.num_start + 1) * (len(self.trajectories) + held)
 
     def step_gain(self, placed: Sequence[Placed], finer: Sequence[Placed], one: FittedStructure) -> tuple[float, int]:
         """Nats that a fitted structure promises in shorter physics steps, infinite if those diverge; and rollouts."""
@@ -172,54 +182,15 @@ class Fitting:
             gain = promised(windows, one.theta, one.starts, one.noise, prior, change)
         return gain, windows.rollouts + shorter.rollouts
 
-    def log_score(
-        self,
-        placed: Sequence[Placed],
-        one: FittedStructure,
-        budget: int,
-        left: int,
-        progress: Progress | None = None,
-    ) -> tuple[float | None, int]:
-        """Log p of the held-out logs given the others, their noise estimated from themselves; and the rollouts.
-
-        Minus infinity where the structure does not follow them at all; None where the budget cut the fit short, whose
-        noise is then that of a stage on the way.
-
-        Args:
-            placed: the structure's extensions.
-            one: fitted to the other logs.
-            budget: rollouts at most, or 300 of each log if that is more.
-            left: rollouts at most, however many logs.
-            progress: called along the way.
-        """
-        assert self.holdout is not None
-        simulator = self.simulator(placed)
-        prior = GaussianMixture(torch.zeros(1), one.mean[None], one.covariance[None], simulator.space)
-        windows = BoundLikelihood(self.likelihood, simulator, self.holdout)
-        most = min(max(budget, 300 * len(self.holdout)), left) - _scoring(windows)
-        if most < 1:
-            return None, 0
-        try:
-            best, rollouts = self._optimum(simulator, prior, self.holdout, one.theta, most, progress)
-            assert best.starts is not None
-            both = scores(windows, best.theta, best.starts, best.noise, QuadraticPrior.of(prior))
-        except BudgetTooSmall:
-            return None, most  # so many at most
-        except ValueError:  # LinAlgError is one
-            return -np.inf, 0
-        short = best.finding is not None and best.finding.code is Code.SEARCH_CUT_SHORT
-        return None if short else both.evidence, rollouts + windows.rollouts
-
     def _optimum(
         self,
         simulator: Simulator,
         prior: Posterior,
-        logs: Trajectories,
         initial: FloatArray | None,
         budget: int,
         progress: Progress | None,
     ) -> tuple[FitResult, int]:
-        """The best optimum of some logs, and the rollouts that the fit took."""
+        """The best optimum, and the rollouts that the fit took."""
         given = None if initial is None else initial[None]
         laplace = Laplace(
             simulator,
@@ -231,7 +202,7 @@ class Fitting:
             initial=given,
             tuning=EVIDENCE_TUNING,
         )
-        laplace.fit(logs)
+        laplace.fit(self.trajectories)
         assert laplace.result is not None
         return laplace.result, laplace.rollouts
 
@@ -247,8 +218,3 @@ def beside(prior: Posterior, space: ParameterSpace) -> Posterior:
     covariance[np.isinf(covariance)] = _FLAT_SD**2
     mean[:n], covariance[:n, :n] = (x.numpy() for x in prior.gaussian_moments())
     return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space)
-
-
-def _scoring(windows: BoundLikelihood) -> int:
-    """Rollouts that the scores of an optimum take."""
-    return (windows.num_theta + windows.num_start + 1) * len(windows.trajectories)

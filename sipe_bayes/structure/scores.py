@@ -1,4 +1,4 @@
-r"""Two scores of a fitted structure: its evidence, and how well it foretells pieces of the logs that it has not seen.
+r"""Two scores of a fitted structure: its evidence, and the log predictive density of pieces that it has not seen.
 
 Both come from one linearisation at the optimum, with the same coloured noise and the windows' starts marginalised, of
 windows that are compared from the same samples on in all structures, as late as the latest sensor asks. With
@@ -10,13 +10,15 @@ support,
     \log p(y) = \log L(\hat\theta) + \tfrac12 g^\top H^{-1} g - \tfrac12 \log|H| + \tfrac N2 \log 2\pi
         + \log P_{\mathcal N(m, H^{-1})}([0, 1]^N) - \log \int_{[0, 1]^N} e^{-E_{prior}} .
 
-The log score of held-out pieces is the sum over pieces k of log p(y_k | y without k) = log p(y) - log p(y without k): a
-log each, or a fifth of the windows of a single log. It is what cross-validation by refitting gives where the model is
+A piece k is a few adjacent windows of a training log, or of a log that no structure is fitted to. Its log predictive
+density is log p(y_k | y without k) = log p(y) - log p(y without k), and log p(y_k | y) of a held-out log. The sum over
+pieces is the expected log predictive density by cross-validation (A. Vehtari, A. Gelman, J. Gabry 2017, "Practical
+Bayesian model evaluation", https://doi.org/10.1007/s11222-016-9696-4); it is what refitting gives where the model is
 linear around its optimum.
 
 Deviations:
 
-- The noise is that of the fit to all pieces.
+- The noise is that of the fit to all training logs.
 - Across a piece's edge the first sample behind it is still whitened with the last one of the piece.
 - Directions that the data leave open get the flat normal of ``likelihood.quadratic_prior``.
 """
@@ -24,27 +26,38 @@ Deviations:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.likelihood import FLAT_PRECISION, BoundLikelihood, Noise, QuadraticPrior
 from sipe_bayes.posterior.truncated_normal import TruncatedNormal
 
-_PIECES = 5  # of a single log
+_PIECES = 40  # of all logs together, at most
+
+
+class Pieces(NamedTuple):
+    """Log predictive densities (K,) in nats of pieces, which log each is of (K,), and how many samples it has (K,)."""
+
+    density: FloatArray
+    log: IntArray
+    samples: IntArray
+
+    def beside(self, other: Pieces) -> Pieces:
+        """These, and pieces of other logs, which are counted on."""
+        log = np.concatenate([self.log, other.log + self.log.max(initial=-1) + 1])
+        both = zip((self.density, self.samples), (other.density, other.samples), strict=True)
+        density, samples = (np.concatenate(pair) for pair in both)
+        return Pieces(density, log, samples)
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Of one structure, in nats.
-
-    Args:
-        evidence: log p(y).
-        held_out: log score of held-out pieces; None where the logs are one window.
-    """
+    """Of one structure: its evidence log p(y) in nats, and its pieces; none where the logs are one window."""
 
     evidence: float
-    held_out: float | None
+    pieces: Pieces
 
 
 def scores(
@@ -71,15 +84,43 @@ def scores(
     moments = windows.moments(linearisation)
     products, constants = moments.normal(noise), _log_determinants(windows, noise)
     linear = _Linear(windows, theta, starts, prior)
-    whole = linear.evidence(products, float(constants.sum()))
-    pieces = _pieces(windows)
-    if len(pieces) < 2 or len(products) < len(windows.log):
-        return Scores(whole, None)
-    without = [
-        linear.evidence(np.where(piece[:, None, None], 0.0, products), float(constants[~piece].sum()))
-        for piece in pieces
-    ]
-    return Scores(whole, float(sum(whole - other for other in without)))
+    whole, parts = linear.evidence(products, float(constants.sum())), _parts(windows)
+    if len(parts) < 2 or len(products) < len(windows.log):
+        return Scores(whole, _pieces(windows, [], np.zeros(0)))
+    without = [linear.evidence_of(products, constants, ~part) for part in parts]
+    return Scores(whole, _pieces(windows, parts, whole - np.array(without)))
+
+
+def predictive(windows: BoundLikelihood, theta: FloatArray, noise: Noise, posterior: QuadraticPrior) -> Pieces:
+    """Pieces of held-out logs; costs two linearisations. Minus infinity where a simulation diverges.
+
+    The starts are those that fit best to first order; the noise is that of the held-out logs themselves, since a
+    model's error differs from motion to motion.
+
+    Args:
+        windows: the held-out logs.
+        theta: (N,), the optimum.
+        noise: (C,), there, at which the estimate of the held-out logs' begins.
+        posterior: of theta, given the training logs.
+    """
+    own, windows = windows, windows.compared_late()
+    parts, starts = _parts(windows), windows.no_starts()
+    begun = windows.linearise(theta, starts, with_theta=False)
+    if begun.valid:
+        starts = starts + windows.log_density(windows.moments(begun), noise, starts)[1]
+    linearisation = windows.linearise(theta, starts)
+    own.rollouts += windows.rollouts if windows is not own else 0
+    moments = windows.moments(linearisation)
+    if len(moments.normal(noise)) < len(windows.log):
+        parts = [np.ones(windows.num_windows, bool)]
+    if not linearisation.valid:
+        return _pieces(windows, parts, np.full(len(parts), -np.inf))
+    pulls = windows.pulls(posterior.precision, posterior.pull(theta), starts)
+    noise = windows.estimate_noise(moments, noise, pulls, True)
+    products, constants = moments.normal(noise), _log_determinants(windows, noise)
+    linear = _Linear(windows, theta, starts, posterior)
+    density = [linear.evidence_of(products, constants, part) for part in parts]
+    return _pieces(windows, parts, np.array(density))
 
 
 @dataclass(frozen=True)
@@ -90,6 +131,10 @@ class _Linear:
     theta: FloatArray
     starts: FloatArray
     prior: QuadraticPrior
+
+    def evidence_of(self, products: FloatArray, constants: FloatArray, which: BoolArray) -> float:
+        """Log p of the rows of some windows (W,) alone."""
+        return self.evidence(np.where(which[:, None, None], products, 0.0), float(constants[which].sum()))
 
     def evidence(self, products: FloatArray, constant: float) -> float:
         """Log p of the rows behind whitened products (W, K, K); constant: their log|2 pi V|."""
@@ -128,12 +173,15 @@ def _log_determinants(windows: BoundLikelihood, noise: Noise) -> FloatArray:
     return out
 
 
-def _pieces(windows: BoundLikelihood) -> list[BoolArray]:
-    """Which windows (W,) each held-out piece has."""
-    logs = np.unique(windows.log)
-    if len(logs) > 1:
-        return [windows.log == k for k in logs]
-    count = min(_PIECES, windows.num_windows)
-    return [
-        np.isin(np.arange(windows.num_windows), part) for part in np.array_split(np.arange(windows.num_windows), count)
-    ]
+def _parts(windows: BoundLikelihood) -> list[BoolArray]:
+    """Which windows (W,) each piece has: adjacent ones of one log."""
+    numbers, logs = np.arange(windows.num_windows), np.unique(windows.log)
+    most = max(_PIECES // len(logs), 1)
+    split = [np.array_split(own, min(most, len(own))) for own in (numbers[windows.log == k] for k in logs)]
+    return [np.isin(numbers, part) for parts in split for part in parts]
+
+
+def _pieces(windows: BoundLikelihood, parts: list[BoolArray], density: FloatArray) -> Pieces:
+    log, samples = windows.log, windows.observed.sum((1, 2))
+    of_log, size = [log[part][0] for part in parts], [samples[part].sum() for part in parts]
+    return Pieces(density, np.array(of_log, np.int64), np.array(size, np.int64))

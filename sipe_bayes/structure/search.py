@@ -1,4 +1,4 @@
-r"""The search over structures: what promises most is fitted, the best is kept, again; then each kept piece is left out.
+r"""The search over structures: what fits best is extended, round by round; then each extension is left out once.
 
 **Steps** (``StructureSearch``), one of them a call of ``step``::
 
@@ -6,26 +6,18 @@ r"""The search over structures: what promises most is fitted, the best is kept, 
       v
     COLUMNS where much is left: signs and units of the logs' columns
       v
-    RANK    score tests of all extensions at the present structure (``candidates``)
-      |  something promises more than it costs          nothing does
-      v                                                      v
-    STEPS   shorter physics steps; if better, RANK            |
-      v                                                      v
-    FIT     the best few, one a step ------------------>  PRUNE   each kept piece left out once
-      |  the best of them is better                           v
-      v                                                    SWAP   what promises as much, in a kept one's place
-    AGAIN   the present structure, from where the             v
-      |     best one ended: still better, it is kept       RESIDUAL  a force without a name, as the yardstick
-      +--> RANK                                               v
-                                                           DONE
+    RANK    score tests of all extensions, shorter integration steps among them, beside each structure of the beam
+      |  something has a predicted gain        nothing has
+      v                                           v
+    FIT     the best few, one a step           PRUNE   each extension of the best structure left out once
+      |  some are clearly better                  v
+      +--> RANK, with these as the beam        RESIDUAL  an unstructured force, as the yardstick
+         none is: PRUNE                           v
+                                                DONE
 
-**Judgement.** A structure S of K extensions out of n has
-
-.. math:: \log p(S \mid y) = \log p(y \mid S) - K (\log n + c) + const,
-
-shorter physics steps paying ``step_gain``, and it counts only where the log score of held-out pieces has become better
-with it as well, and where the logs that no fit has seen do not speak against it. Structures that are about equally good
-are not decided between: ``Structures.posterior`` averages over them.
+**Judgement** is ``comparison``'s alone: a structure is extended where it predicts pieces that it has not seen clearly
+better than all that it contains, and is not clearly behind the best one. An extension is fitted from a predicted gain
+of five nats on: one that gains less than eight in the end is never clear of its own standard error.
 """
 
 from __future__ import annotations
@@ -33,21 +25,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.budget import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.inference.recorded import Progress
-from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, QuadraticPrior
-from sipe_bayes.structure.candidates import Candidate, candidates, first
+from sipe_bayes.likelihood import QuadraticPrior
+from sipe_bayes.structure.candidates import Candidate, candidates
 from sipe_bayes.structure.columns import Column, channels_of, choices, is_explained, log_jacobian, moving, unexplained
+from sipe_bayes.structure.comparison import choose_ties, difference
 from sipe_bayes.structure.extension import Extension, Placed, members, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
 from sipe_bayes.structure.machine import Machine, machine_of
 from sipe_bayes.structure.physics_step import StepLadder, shorter_steps
-from sipe_bayes.structure.rivals import behind, rivals
-from sipe_bayes.structure.state import BUDGET, DiscoverOptions, DiscoverState, Judgement, Offer, Phase
+from sipe_bayes.structure.state import BUDGET, DiscoverOptions, DiscoverState, Offer, Phase
 
 
 class StructureSearch:
@@ -93,11 +85,8 @@ class StructureSearch:
             Phase.PLAIN: self._plain,
             Phase.COLUMNS: self._columns,
             Phase.RANK: self._rank,
-            Phase.STEPS: self._shorter_steps,
             Phase.FIT: self._fit,
-            Phase.AGAIN: self._again,
             Phase.PRUNE: self._prune,
-            Phase.SWAP: self._swap,
             Phase.RESIDUAL: self._residual,
             Phase.DONE: lambda state: state,
         }[state.phase](state)
@@ -116,31 +105,19 @@ class StructureSearch:
         """The extensions wherever the machine has a place for them, after the first step."""
         return self._placed
 
-    @cached_property
-    def cost(self) -> float:
-        """Nats that an extension has to gain because there were so many to choose from."""
-        named = [p for p in self._placed.values() if not p.extension.last_resort]
-        return math.log(max(len(self._ladder.pieces([p.label for p in named])), 1)) + self.options.sparsity
+    def counts(self, state: DiscoverState, one: FittedStructure) -> bool:
+        """Whether a structure has named extensions alone, and the budget did not end in its fit."""
+        cut_off = state.cut is not None and one is state.fitted[-1] is not state.fitted[0] and not one.settled
+        return not cut_off and not any(self._placed[label].extension.last_resort for label in one.labels)
 
-    def total(self, one: FittedStructure) -> float:
-        """Log posterior of a structure up to a constant."""
-        pieces, rung = self._ladder.pieces(one.labels), self._ladder.rung(one.labels)
-        return one.evidence - self.cost * len(pieces) - self.options.step_gain * rung
+    def supported(self, state: DiscoverState) -> list[FittedStructure]:
+        """The set that the logs support: ties, the simplest one first, of native elements where these do as well."""
 
-    def price(self, label: str) -> float:
-        """Nats that a piece has to gain."""
-        return self.options.step_gain * self._ladder.rung([label]) or self.cost
+        def simple(one: FittedStructure) -> tuple[int, bool, float]:
+            native = all(self._placed[label].extension.native for label in one.labels)
+            return len(one.labels), not native, -difference(one, state.fitted[0]).nats
 
-    def foretells(self, one: FittedStructure, other: FittedStructure) -> bool:
-        """Whether held-out pieces speak for a structure rather than a smaller one, or not against finer steps."""
-        if one.held_out is None or other.held_out is None:
-            return True
-        alike = set(self._ladder.pieces(one.labels)) == set(self._ladder.pieces(other.labels))
-        return one.held_out > other.held_out - self.options.against * alike
-
-    def better(self, one: FittedStructure, other: FittedStructure) -> bool:
-        """Whether both scores speak for a structure rather than for a smaller one."""
-        return self.total(one) > self.total(other) and self.foretells(one, other)
+        return sorted(choose_ties([one for one in state.fitted if self.counts(state, one)]), key=simple)
 
     def enough(self, labels: Sequence[str]) -> int:
         """Rollouts that the fit of a structure may have."""
@@ -218,31 +195,39 @@ class StructureSearch:
         return one, one.rollouts
 
     def _rank(self, state: DiscoverState) -> DiscoverState:
-        if len(self._ladder.pieces(state.present)) >= self.options.most:
-            return replace(state, phase=Phase.PRUNE)
-        state, ranked = self._ranked(state, state.here, last_resort=False)
-        if state.cut is not None:
-            return state
-        promising = [c for c in ranked if c.gain > self.cost + self.options.least_gain]
-        untried = [c for c in promising if not state.is_tried((*state.present, c.placed.label))]
-        queue = tuple(c.placed.label for c in first(untried, self.options.width, self.options.tied))
-        if not queue:
-            return replace(state, phase=Phase.PRUNE)
-        finer = self._ladder.finer(state.present)
-        tried = finer is None or state.is_tried(finer)
-        return replace(state, queue=queue, phase=Phase.FIT if tried else Phase.STEPS)
+        """What extensions promise beside one structure of the beam; or which structures are to be fitted."""
+        for labels in state.beam:
+            if labels not in state.ranked and len(self._ladder.pieces(labels)) < self.options.most:
+                here = state.of(labels)
+                assert here is not None
+                return self._ranked(state, here, last_resort=False)[0]
+        queue = self._queue(state)
+        return replace(state, queue=queue, phase=Phase.FIT if queue else Phase.PRUNE)
 
-    def _shorter_steps(self, state: DiscoverState) -> DiscoverState:
-        """The present structure in shorter physics steps, which may be all, if they promise half of what they must."""
-        here, labels = state.here, self._ladder.finer(state.present) or ()
-        price, least = self.options.step_gain, self.options.step_share * state.promised
-        gain, rollouts = self.fitting.step_gain(self.structure(here.labels), self.structure(labels), here)
-        state = replace(state, rank_rollouts=state.rank_rollouts + rollouts)
-        fitted = self._fitted(state, labels, here.theta) if gain > 0.5 * max(price, least) else state
-        one = fitted.of(labels)
-        if one is None or not self.better(one, here) or one.evidence - here.evidence < least:
-            return replace(fitted, phase=Phase.FIT)
-        return replace(fitted, present=labels, queue=(), phase=Phase.RANK)
+    def _queue(self, state: DiscoverState) -> tuple[tuple[str, ...], ...]:
+        """The structures with the largest predicted gains, beside what their part gains already; no tried ones.
+
+        Beside the model as it is, as many again whose predicted gains are the same to two standard errors.
+        """
+        options, plain, queue = self.options, state.fitted[0], dict[frozenset[str], tuple[float, tuple[str, ...]]]()
+        for labels in state.beam:
+            here = state.of(labels)
+            before = 0.0 if here is None else difference(here, plain).nats
+            own = {offer.label: offer for offer in state.offers if offer.at == labels}  # the last of each
+            for offer in own.values():
+                grown = self._grown(offer)
+                if offer.gain > options.least_gain and not state.is_tried(grown):
+                    queue.setdefault(frozenset(grown), (before + offer.gain, grown))
+        ranked = sorted(queue.values(), key=lambda item: -item[0])
+        level = ranked[0][0] - 2 * math.sqrt(2 * max(ranked[0][0], 0.0)) if ranked else 0.0
+        most = 2 * options.width if state.beam == ((),) else options.width
+        close = [item for item in ranked[options.width : most] if item[0] >= level]
+        return tuple(grown for _, grown in ranked[: options.width] + close)
+
+    def _grown(self, offer: Offer) -> tuple[str, ...]:
+        """Labels of a structure with what was offered beside it; shorter steps take the place of longer ones."""
+        stepped = offer.label in self._ladder.labels
+        return (*(self._ladder.pieces(offer.at) if stepped else offer.at), offer.label)
 
     def _ranked(
         self, state: DiscoverState, here: FittedStructure, last_resort: bool
@@ -263,6 +248,10 @@ class StructureSearch:
             cut = state.phase
         offers = tuple(Offer(here.labels, c.placed.label, c.gain, c.theta, c.others) for c in ranked)
         ranks = state.rank_rollouts + windows.rollouts
+        finer = None if last_resort or cut is not None else self._ladder.finer(here.labels)
+        if finer is not None:
+            gain, rollouts = fitting.step_gain(own, self.structure(finer), here)
+            offers, ranks = (*offers, Offer(here.labels, finer[-1], gain, np.zeros(0), here.theta)), ranks + rollouts
         done = (*state.ranked, here.labels) if cut is None and not last_resort else state.ranked
         return replace(state, offers=state.offers + offers, ranked=done, rank_rollouts=ranks, cut=cut), ranked
 
@@ -271,107 +260,51 @@ class StructureSearch:
         return max(self.budget - state.rollouts, 0)
 
     def _fit(self, state: DiscoverState) -> DiscoverState:
-        label, *rest = state.queue
-        offer = next(o for o in reversed(state.offers) if o.label == label and o.at == state.present)
-        state = self._fitted(state, (*state.present, label), np.concatenate([offer.others, offer.theta]))
+        labels, *rest = state.queue
+        offer = next(o for o in reversed(state.offers) if self._grown(o) == labels)
+        state = self._fitted(state, labels, np.concatenate([offer.others, offer.theta]))
         if state.cut is not None:
             return state
         state = replace(state, queue=tuple(rest))
-        return state if rest else self._settled(state)
+        if rest:
+            return state
+        beam = self._next_beam(state)
+        return replace(state, beam=beam, phase=Phase.RANK) if beam else replace(state, phase=Phase.PRUNE)
 
-    def _settled(self, state: DiscoverState) -> DiscoverState:
-        """The round's best is looked at once more, or the search for more ends."""
-        best = self._best_grown(state)
-        onward = replace(state, phase=Phase.PRUNE)
-        return onward if best is None else replace(state, larger=best.labels, phase=Phase.AGAIN)
+    def _next_beam(self, state: DiscoverState) -> tuple[tuple[str, ...], ...]:
+        """Labels of the best new structures that are clearly better than what they contain, and not clearly behind."""
+        plain, best = state.fitted[0], self._best(state)
+        new = [one for one in state.fitted if one.labels not in state.ranked and not difference(best, one).clear]
+        better = [one for one in new if all(difference(one, part).clear for part in _parts(state, one))]
+        better.sort(key=lambda one: -difference(one, plain).nats)
+        return tuple(one.labels for one in better[: self.options.beam])
 
-    def _best_grown(self, state: DiscoverState) -> FittedStructure | None:
-        """The best of those with one extension more, where it is better than the present structure."""
-        here = state.here
-        grown = [o for o in state.fitted if len(o.labels) == len(here.labels) + 1 and set(here.labels) < set(o.labels)]
-        allowed = [one for one in grown if not state.is_refused(one.labels) and self.better(one, here)]
-        return max(allowed, key=self.total, default=None)
-
-    def _judged(self, state: DiscoverState, one: FittedStructure) -> DiscoverState:
-        """With what the held-out logs say of a structure and of the present one, where there are such logs."""
-        for each in (state.here, one) if self.fitting.holdout is not None else ():
-            if state.judgement(each.labels) is None:
-                own = self.structure(each.labels)
-                most = self.enough(each.labels), self._left(state)
-                log_score, rollouts = self.fitting.log_score(own, each, *most, self._tell)
-                rollouts = self._fit_rollouts if log_score == -np.inf else rollouts
-                state = replace(state, judged=(*state.judged, Judgement(each.labels, log_score, rollouts)))
-        return state
-
-    def _speaks_against(self, state: DiscoverState, one: FittedStructure) -> bool:
-        """Whether held-out logs are foretold worse by a structure than by the present one."""
-        here, other = state.judgement(state.present), state.judgement(one.labels)
-        return bool(here and other and behind(other.log_score, here.log_score) > self.options.against)
-
-    def _again(self, state: DiscoverState) -> DiscoverState:
-        """The present structure from where the larger one ended, whose gain may be nothing but a better optimum."""
-        here, larger = state.here, state.of(state.larger)
-        assert larger is not None
-        keep = [i for i, label in enumerate(self._owners(larger)) if label in (None, *here.labels)]
-        refitted, fitted = self._fitted(state, here.labels, larger.theta[keep]), state.fitted
-        if len(refitted.fitted) > len(fitted):
-            *_, once_more = refitted.fitted
-            better = once_more if once_more.evidence > here.evidence else here
-            better = replace(better, rollouts=here.rollouts + once_more.rollouts)
-            fitted = tuple(better if one is here else one for one in fitted)
-        state = replace(refitted, fitted=fitted, failed=state.failed)
-        best = self._best_grown(state)
-        if best is not None and self._speaks_against(state := self._judged(state, best), best):
-            return self._settled(replace(state, refused=(*state.refused, best.labels), larger=()))
-        onward = Phase.PRUNE if best is None and state.here is here else Phase.RANK
-        return replace(state, larger=(), phase=onward, present=state.present if best is None else best.labels)
+    def _best(self, state: DiscoverState) -> FittedStructure:
+        """The structure that predicts best."""
+        return max(state.fitted, key=lambda one: difference(one, state.fitted[0]).nats)
 
     def _prune(self, state: DiscoverState) -> DiscoverState:
-        """One smaller structure fitted, or all of them compared."""
-        here = state.here
-        if len(here.labels) < 2:
-            return replace(state, phase=Phase.SWAP)
-        smaller = [tuple(x for x in here.labels if x != label) for label in here.labels]
-        for labels in smaller:
-            if state.of(labels) is None and labels not in state.failed:
-                keep = [i for i, label in enumerate(self._owners(here)) if label in (None, *labels)]
-                return self._fitted(state, labels, here.theta[keep])
-        known = [one for labels in smaller if (one := state.of(labels)) is not None]
-        without = [one for one in known if not self.better(here, one)]
-        if without:
-            return replace(state, present=max(without, key=self.total).labels)
-        return replace(state, phase=Phase.SWAP)
-
-    def _swap(self, state: DiscoverState) -> DiscoverState:
-        """What is left without one kept piece ranked, one structure with a rival fitted, or all of them compared."""
-        here, options = state.here, self.options
-        for kept in self._ladder.pieces(here.labels) if options.rivals else ():
-            without = state.of([label for label in here.labels if label != kept])
-            if without is None:
-                continue
-            if without.labels not in state.ranked:
-                return self._ranked(state, without, last_resort=False)[0]
-            for offer in rivals(state.offers, without.labels, here.labels, options.rival, options.rivals):
-                labels = (*without.labels, offer.label)
-                if state.of(labels) is None and labels not in state.failed:
-                    return self._fitted(state, labels, np.concatenate([offer.others, offer.theta]))
-        own, close = set(here.labels), [one for one in state.fitted if len(one.labels) == len(here.labels)]
-        close = [one for one in close if len(own ^ set(one.labels)) == 2 and not state.is_refused(one.labels)]
-        best = max((one for one in close if self.better(one, here)), key=self.total, default=None)
-        if best is None:  # what pieces speak against does not count, whatever its evidence
-            lost = [one.labels for one in close if behind(one.held_out, here.held_out) > options.against]
-            return replace(state, phase=Phase.RESIDUAL, refused=(*state.refused, *lost))
-        if self._speaks_against(state := self._judged(state, best), best):
-            return replace(state, refused=(*state.refused, best.labels))
-        return replace(state, present=best.labels, phase=Phase.PRUNE)
+        """The best structure without one of its extensions, from where it ended itself."""
+        best = self._best(state)
+        for left_out in best.labels:
+            labels = tuple(label for label in best.labels if label != left_out)
+            if labels not in state.pruned and labels not in state.failed:
+                keep = [i for i, label in enumerate(self._owners(best)) if label in (None, *labels)]
+                before, failed = state.of(labels), state.failed
+                state = self._fitted(state, labels, best.theta[keep])
+                if before is not None:  # a failure says nothing then
+                    state = replace(state, fitted=_merged(state.fitted, before), failed=failed)
+                return replace(state, pruned=(*state.pruned, labels))
+        return replace(state, phase=Phase.RESIDUAL)
 
     def _residual(self, state: DiscoverState) -> DiscoverState:
-        state, ranked = self._ranked(state, state.here, last_resort=True)
+        here = self.supported(state)[0]
+        state, ranked = self._ranked(state, here, last_resort=True)
         if state.cut is not None:
             return state
-        if ranked and ranked[0].gain > self.cost + self.options.least_gain:
-            labels = (*state.present, ranked[0].placed.label)
-            state = self._fitted(state, labels, np.concatenate([state.here.theta, ranked[0].theta]))
+        if ranked and ranked[0].gain > self.options.least_gain:
+            labels = (*here.labels, ranked[0].placed.label)
+            state = self._fitted(state, labels, np.concatenate([here.theta, ranked[0].theta]))
         return replace(state, phase=Phase.DONE)
 
     def _owners(self, one: FittedStructure) -> list[str | None]:
@@ -397,3 +330,18 @@ class StructureSearch:
             spent = state.failed_rollouts + one.rollouts
             return replace(state, failed=(*state.failed, labels), failed_rollouts=spent, cut=cut)
         return replace(state, fitted=(*state.fitted, one), cut=cut)
+
+
+def _parts(state: DiscoverState, one: FittedStructure) -> list[FittedStructure]:
+    """The fitted structures that one contains."""
+    return [other for other in state.fitted if set(other.labels) < set(one.labels)]
+
+
+def _merged(fitted: tuple[FittedStructure, ...], before: FittedStructure) -> tuple[FittedStructure, ...]:
+    """With the better one of two fits of a structure, the later of which comes last, in the place of the first."""
+    *rest, again = fitted
+    if again is before or set(again.labels) != set(before.labels):
+        return fitted
+    better = again if again.evidence > before.evidence else before
+    better = replace(better, labels=before.labels, rollouts=before.rollouts + again.rollouts)
+    return tuple(better if one is before else one for one in rest)

@@ -19,16 +19,10 @@ BUDGET = 30_000  # rollouts by default: structures with two pieces of a machine 
 class DiscoverOptions(Options):
     """How structures are searched."""
 
-    width: int = option(3, "candidates that are fitted in a round; twice as many where they promise the same", least=1)
-    tied: float = option(0.05, "of the best gain, within which candidates promise the same", least=0)
+    width: int = option(3, "candidates that are fitted beside a structure; twice as many if alike", least=1)
+    beam: int = option(2, "structures that each round extends", least=1)
     most: int = option(5, "extensions that a structure may have", least=1)
-    against: float = option(2.0, "nats of held-out logs that speak against an extension", "nats", least=0)
-    rivals: int = option(3, "of a kept piece that are tried in its place", least=0)
-    rival: float = option(0.1, "of what a kept piece promises in its place, by which a rival may fall behind", least=0)
-    step_gain: float = option(2.0, "evidence that shorter physics steps must gain", "nats", least=0)
-    step_share: float = option(0.5, "of the best promise, that they must gain to be gone on from", least=0)
-    least_gain: float = option(2.0, "promised gain beyond an extension's cost from which it is fitted", "nats", above=0)
-    sparsity: float = option(1.0, "against any extension: a model is expected to lack exp(-1) pieces", "nats", least=0)
+    least_gain: float = option(5.0, "predicted gain from which an extension is fitted", "nats", above=0)
     gross: float = option(THRESHOLDS.gross, "of a channel's spread left from which signs and units are tried", least=0)
     column_gain: float = option(50.0, "evidence that a sign or unit must gain", "nats", above=0)
     column_share: float = option(0.2, "of the budget, for signs and units at most", above=0, below=1)
@@ -44,11 +38,8 @@ class Phase(enum.Enum):
     PLAIN = "plain"
     COLUMNS = "columns"
     RANK = "rank"
-    STEPS = "steps"
     FIT = "fit"
-    AGAIN = "again"
     PRUNE = "prune"
-    SWAP = "swap"
     RESIDUAL = "residual"
     DONE = "done"
 
@@ -73,60 +64,40 @@ class Offer:
 
 
 @dataclass(frozen=True)
-class Judgement:
-    """What logs that no fit has seen say of a structure.
-
-    Args:
-        labels: of the structure.
-        log_score: log p of the held-out logs given the others, in nats, their noise estimated from themselves; None
-            where the budget cut its fit to them short.
-        rollouts: that it took.
-    """
-
-    labels: tuple[str, ...]
-    log_score: float | None
-    rollouts: int
-
-
-@dataclass(frozen=True)
 class DiscoverState:
     """Where a search over structures stands.
 
     Args:
         phase: what comes next.
         fitted: structures, the plain model first.
-        present: labels of the structure that is gone on from.
-        larger: labels of the structure that is better than it, while it is fitted again.
-        offers: all that was promised until now.
-        ranked: labels of structures at which all extensions were asked what they promise.
-        queue: labels of the extensions that this round still has to fit.
+        beam: labels of the structures that this round extends.
+        offers: predicted gains until now.
+        ranked: labels of structures at which all extensions were ranked.
+        queue: labels of the structures that this round still has to fit.
+        pruned: labels of structures that were fitted from a larger one that ended elsewhere.
         failed: labels of structures that could not be fitted.
         columns: of the logs that are multiplied, since then the plain model fits far better.
         column_rollouts: of the trials of signs and units.
         rank_rollouts: of the rankings.
         failed_rollouts: of fits that failed, as far as they told.
         untried: signs and units that their share of the budget did not reach.
-        judged: what held-out logs say of structures.
-        refused: labels of structures that they speak against.
         cut: what the search was doing when the budget was spent; None while it is not.
         budget: rollouts at most, of which the plain fit and the trials of columns get a share.
     """
 
     phase: Phase = Phase.PLAIN
     fitted: tuple[FittedStructure, ...] = ()
-    present: tuple[str, ...] = ()
-    larger: tuple[str, ...] = ()
+    beam: tuple[tuple[str, ...], ...] = ((),)
     offers: tuple[Offer, ...] = ()
     ranked: tuple[tuple[str, ...], ...] = ()
-    queue: tuple[str, ...] = ()
+    queue: tuple[tuple[str, ...], ...] = ()
+    pruned: tuple[tuple[str, ...], ...] = ()
     failed: tuple[tuple[str, ...], ...] = ()
     columns: tuple[Column, ...] = ()
     column_rollouts: int = 0
     rank_rollouts: int = 0
     failed_rollouts: int = 0
     untried: tuple[Column, ...] = ()
-    judged: tuple[Judgement, ...] = ()
-    refused: tuple[tuple[str, ...], ...] = ()
     cut: Phase | None = None
     budget: int = 0
 
@@ -143,25 +114,17 @@ class DiscoverState:
 
     def describe(self, extensions: int) -> str:
         """What comes next, for the progress bar; of so many extensions."""
-        having = f" beside {' and '.join(self.present)}" if self.present else ""
+        at = next((labels for labels in self.beam if labels not in self.ranked), ())
+        beside = f" beside {' and '.join(at)}" if at else ""
         return {
             Phase.PLAIN: "fitting the model as it is",
             Phase.COLUMNS: "trying signs and units of the logs' columns",
-            Phase.RANK: f"testing {extensions} extensions{having}",
-            Phase.STEPS: f"fitting shorter physics steps{having}",
-            Phase.FIT: f"fitting {self.queue[0] if self.queue else ''}{having}",
-            Phase.AGAIN: f"fitting without {self.larger[-1] if self.larger else ''} once more",
-            Phase.PRUNE: "leaving out each piece once",
-            Phase.SWAP: "trying what promises as much in the place of what is kept",
-            Phase.RESIDUAL: "fitting a force without a name",
+            Phase.RANK: f"testing {extensions} extensions{beside}",
+            Phase.FIT: f"fitting {' and '.join(self.queue[0]) if self.queue else ''}",
+            Phase.PRUNE: "leaving out each extension once",
+            Phase.RESIDUAL: "fitting an unstructured residual force",
             Phase.DONE: "done",
         }[self.phase]
-
-    @property
-    def promised(self) -> float:
-        """The most that something in the queue promises."""
-        gains = (o.gain for o in self.offers if o.at == self.present and o.label in self.queue)
-        return max(gains, default=0.0)
 
     @property
     def done(self) -> bool:
@@ -170,9 +133,9 @@ class DiscoverState:
 
     @property
     def rollouts(self) -> int:
-        """Of all fits, those that failed or had other signs and units too, of rankings, of looks at held-out logs."""
+        """Of all fits, those that failed or had other signs and units too, and of rankings."""
         beside = self.column_rollouts + self.rank_rollouts + self.failed_rollouts
-        return sum(one.rollouts for one in self.fitted) + sum(one.rollouts for one in self.judged) + beside
+        return sum(one.rollouts for one in self.fitted) + beside
 
     def of(self, labels: Sequence[str]) -> FittedStructure | None:
         """The fit of a structure, whatever the order of its extensions."""
@@ -185,18 +148,3 @@ class DiscoverState:
     def surpasses(self, one: FittedStructure) -> bool:
         """Whether one with fewer of its pieces has the greater evidence: then the search has not ended yet."""
         return any(set(o.labels) < set(one.labels) and o.evidence > one.evidence for o in self.fitted)
-
-    def judgement(self, labels: Sequence[str]) -> Judgement | None:
-        """What held-out logs say of a structure, whatever the order of its extensions."""
-        return next((one for one in self.judged if set(one.labels) == set(labels)), None)
-
-    def is_refused(self, labels: Sequence[str]) -> bool:
-        """Whether held-out logs speak against a structure, whatever the order of its extensions."""
-        return any(set(one) == set(labels) for one in self.refused)
-
-    @property
-    def here(self) -> FittedStructure:
-        """The fit of the present structure."""
-        here = self.of(self.present)
-        assert here is not None
-        return here

@@ -1,4 +1,4 @@
-"""What a search over structures has to say: a distribution over structures, and the posterior averaged over it."""
+"""What a search over structures has to say: the set that the logs support, and the posterior stacked over it."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior import GaussianMixture
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.columns import Column
+from sipe_bayes.structure.comparison import difference, stack
 from sipe_bayes.structure.extension import Placed
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.search import StructureSearch
 from sipe_bayes.structure.state import DiscoverState, Offer, Phase
 
-_NEGLIGIBLE = 1e-3  # probability below which a structure is left out of the average
+_NEGLIGIBLE = 1e-3  # weight below which a structure is left out of the average
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,12 @@ class StructureRow:
         sentences: what the structure has beyond the plain model; empty for it.
         labels: of its extensions.
         evidence: nats over the plain model.
-        held_out: nats of held-out pieces over the plain model; None where there are no pieces.
-        probability: of the structure, given the logs.
+        gain: log predictive density of held-out pieces over the plain model's, in nats.
+        error: standard error of the gain.
+        behind: nats by which it predicts worse than the first structure of the set that the logs support.
+        behind_error: standard error of that.
+        tied: whether it is of that set: structures that the logs do not tell apart.
+        weight: in the stacked predictions; zero outside the set that the logs support.
         rollouts: that its fit took.
         yardstick: whether it has a force without a name, and is no candidate itself.
     """
@@ -38,8 +43,12 @@ class StructureRow:
     sentences: tuple[str, ...]
     labels: tuple[str, ...]
     evidence: float
-    held_out: float | None
-    probability: float
+    gain: float
+    error: float
+    behind: float
+    behind_error: float
+    tied: bool
+    weight: float
     rollouts: int
     yardstick: bool
 
@@ -75,7 +84,7 @@ class Structures:
     def settled(self) -> bool:
         """Whether every fit that matters came to rest and the budget was enough, but for the yardstick."""
         enough = self.state.done and self.state.cut in (None, Phase.RESIDUAL)
-        return enough and all(one.settled for p, one in zip(self.probabilities, self.fitted, strict=True) if p)
+        return enough and all(one.settled for one in self.supported)
 
     @property
     def so_far(self) -> str:
@@ -83,41 +92,35 @@ class Structures:
         if not self.fitted:
             return ""
         count = f"{len(self.fitted)} structures fitted" if len(self.fitted) > 1 else "the model as it is fitted"
-        if not self.state.present:
+        self.search.place(self.state)
+        here = self.best
+        if not here.labels:
             return f"{count}, nothing kept so far"
-        here, sizes, placed = self.state.here, [], self.search.placed
-        known = all(label in placed for label in here.labels)  # not before a search that goes on has begun
-        own = [parameter for piece in self.placed(here) for parameter in piece.parameters] if known else []
+        sizes = []
+        own = [parameter for piece in self.placed(here) for parameter in piece.parameters]
         for parameter, theta in zip(own, here.theta[len(here.theta) - len(own) :], strict=True):
             sizes.append(f"{parameter.targets[0]} {float(parameter.value(theta)):.3g} {parameter.unit}".rstrip())
         kept = " + ".join(here.labels) + (f" ({', '.join(sizes)})" if sizes else "")
         return f"{count}, kept so far {kept}, {here.evidence - self.plain.evidence:.0f} nats over the model as it was"
 
     @cached_property
-    def probabilities(self) -> FloatArray:
-        """(S,) of the fitted structures; zero where held-out pieces speak against one, or a piece has no name."""
-        totals = np.array([self.search.total(one) if self._counts(one) else -np.inf for one in self.fitted])
-        weight = np.exp(totals - totals.max())
-        return weight / weight.sum()
+    def supported(self) -> tuple[FittedStructure, ...]:
+        """The set that the logs support: structures that they do not tell apart, the simplest one first."""
+        return tuple(self.search.supported(self.state))
 
-    def _counts(self, one: FittedStructure) -> bool:
-        """Whether a structure of named pieces foretells held-out pieces better than every smaller one tried.
-
-        And whether no held-out log speaks against it, and the budget did not end in its fit.
-        """
-        cut_off = self.state.cut is not None and one is self.fitted[-1] is not self.plain and not one.settled
-        if self._is_yardstick(one) or self.state.is_refused(one.labels) or cut_off:
-            return False
-        smaller = [o for o in self.fitted if set(o.labels) < set(one.labels)]
-        return all(self.search.foretells(one, other) for other in smaller)
+    @cached_property
+    def weights(self) -> FloatArray:
+        """Stacking weights (S,) of the fitted structures; zero outside the set that the logs support."""
+        stacked = dict(zip(map(id, self.supported), stack(self.supported).tolist(), strict=True))
+        return np.array([stacked.get(id(one), 0.0) for one in self.fitted])
 
     def _is_yardstick(self, one: FittedStructure) -> bool:
         return any(self.search.placed[label].extension.last_resort for label in one.labels)
 
     @property
     def best(self) -> FittedStructure:
-        """The most probable structure."""
-        return self.fitted[int(self.probabilities.argmax())]
+        """The simplest structure of the set, of native MJCF elements where these do as well."""
+        return self.supported[0]
 
     @property
     def plain(self) -> FittedStructure:
@@ -133,10 +136,10 @@ class Structures:
         return self.search.fitting.simulator(self.placed(one))
 
     def inclusion(self) -> dict[str, float]:
-        """Probability of each extension that was tried, most probable first."""
+        """Sum of the weights of the structures with each extension that was tried, largest first."""
         labels = {label for one in self.fitted for label in one.labels}
         sums = {
-            label: float(sum(p for p, o in zip(self.probabilities, self.fitted, strict=True) if label in o.labels))
+            label: float(sum(p for p, o in zip(self.weights, self.fitted, strict=True) if label in o.labels))
             for label in labels
         }
         return dict(sorted(sums.items(), key=lambda item: (-item[1], item[0])))
@@ -146,16 +149,13 @@ class Structures:
         return sorted((o for o in self.state.offers if set(o.at) == set(at)), key=lambda o: -o.gain)
 
     def table(self) -> list[StructureRow]:
-        """All that was fitted, most probable first."""
-        plain, rows = self.plain, []
-        for p, one in zip(self.probabilities.tolist(), self.fitted, strict=True):
-            held_out = None
-            if one.held_out is not None and plain.held_out is not None:
-                held_out = one.held_out - plain.held_out
-            sentences = tuple(x.sentence for x in self.placed(one))
-            gain = one.evidence - plain.evidence
-            rows.append(StructureRow(sentences, one.labels, gain, held_out, p, one.rollouts, self._is_yardstick(one)))
-        return sorted(rows, key=lambda row: (-row.probability, -row.evidence))
+        """All that was fitted: the set that the logs support, then by what they predict."""
+        rows, order = [], {one.labels: k for k, one in enumerate(self.supported)}
+        for weight, one in zip(self.weights.tolist(), self.fitted, strict=True):
+            sentences, evidence = tuple(x.sentence for x in self.placed(one)), one.evidence - self.plain.evidence
+            scores = (evidence, *difference(one, self.plain), *difference(self.best, one), one.labels in order, weight)
+            rows.append(StructureRow(sentences, one.labels, *scores, one.rollouts, self._is_yardstick(one)))
+        return sorted(rows, key=lambda row: (order.get(row.labels, len(order)), -row.gain))
 
     @property
     def named_share(self) -> float | None:
@@ -185,8 +185,8 @@ class Structures:
         return self._averaged(ParameterSpace(self.search.placed[label].parameters), having)
 
     def _weighed(self) -> list[tuple[float, FittedStructure]]:
-        """Structures that count, with their probabilities."""
-        pairs = zip(self.probabilities.tolist(), self.fitted, strict=True)
+        """Structures of the set, with their weights."""
+        pairs = zip(self.weights.tolist(), self.fitted, strict=True)
         return [(p, one) for p, one in pairs if p > _NEGLIGIBLE]
 
     @staticmethod
@@ -195,7 +195,7 @@ class Structures:
         own = [(one, slice(first, first + len(space))) for _, one, first in parts]
         means = np.stack([one.mean[at] for one, at in own])
         covariances = np.stack([one.spanned[at, at] for one, at in own])
-        # a draw is to come from a structure with its probability, however much of its normal the cube cuts off
+        # a draw is to come from a structure with its weight, however much of its normal the cube cuts off
         return GaussianMixture(np.log([p for p, _, _ in parts]), means, covariances, space).of_masses()
 
     def posterior_of(self, one: FittedStructure) -> GaussianMixture:

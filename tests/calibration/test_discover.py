@@ -44,10 +44,10 @@ def test_finds_what_was_planted(case: tuple[Path, Discovery]) -> None:
     _, found = case
     (piece,) = found.kept
     assert piece.label == "dry_friction:hinge"
-    assert piece.probability > 0.9
-    assert piece.evidence is not None
-    assert piece.held_out is not None
-    assert min(piece.evidence, piece.held_out) > 3
+    assert piece.weight == pytest.approx(1.0)
+    assert piece.gain is not None
+    assert piece.error is not None
+    assert piece.gain > 2 * piece.error
     (friction,) = found.added
     assert abs(friction.mode - FRICTION) < 5 * friction.sd
     (held_out,) = [row for row in found.errors if row.use == "holdout"]
@@ -102,7 +102,7 @@ def test_folder_is_complete(case: tuple[Path, Discovery]) -> None:
     assert json.loads((out / "run.json").read_text())["status"] == "complete"
     data = json.loads((out / "structures.json").read_text())
     assert data["structures"][0]["labels"] == ["dry_friction:hinge"]
-    assert sum(row["probability"] for row in data["structures"]) == pytest.approx(1.0)
+    assert sum(row["weight"] for row in data["structures"]) == pytest.approx(1.0)
     assert "What the model of" in (out / "report.html").read_text(encoding="utf-8")
 
 
@@ -119,17 +119,17 @@ def test_discovered_configuration_finds_the_same_optimum(case: tuple[Path, Disco
     assert [p["name"] for p in data["parameters"]] == ["rod_mass", "damping", "hinge.dry_friction"]
     assert not Path(data["model"]).is_absolute()
     assert data["search"]["start"] == pytest.approx(dict(found.best))
-    assert data["structure"]["probability"] == pytest.approx(found.kept[0].probability, rel=0.01)
+    assert data["structure"]["weight"] == pytest.approx(found.kept[0].weight, rel=0.01)
     again = run(Path(found.out) / "discovered.toml", out=config.parent / "again", num_threads=1)
     best = json.loads((Path(found.out) / "structures.json").read_text())["best"]
     assert {p.name: p.mode for p in again.parameters} == pytest.approx(best, rel=1e-2)
 
 
-@pytest.mark.parametrize(("probability", "told"), [(0.62, True), (0.95, False)])
-def test_how_probable_the_structure_was_is_not_forgotten(probability: float, told: bool, tmp_path: Path) -> None:
-    config = write_lacking(tmp_path, structure=f"[structure]\nprobability = {probability}\n")
-    said = [text for text in sipe.prepare(config, 1).warnings if "the structure of this model" in text]
-    assert [f"a probability of {probability:.2g}" in text for text in said] == [True] * told
+@pytest.mark.parametrize(("weight", "told"), [(0.62, True), (0.95, False)])
+def test_that_other_structures_predict_as_well_is_not_forgotten(weight: float, told: bool, tmp_path: Path) -> None:
+    config = write_lacking(tmp_path, structure=f"[structure]\nweight = {weight}\n")
+    said = [text for text in sipe.prepare(config, 1).warnings if "predict these logs as well" in text]
+    assert [f"a stacking weight of {weight:.2g}" in text for text in said] == [True] * told
 
 
 def test_what_mjcf_has_no_element_for_travels_with_the_model_and_is_said(tmp_path: Path) -> None:
@@ -166,7 +166,7 @@ def test_shorter_steps_are_written_into_the_model(tmp_path: Path) -> None:
     (piece,) = discovery.kept
     seconds = {"physics_step:2.5 ms": "0.0025", "physics_step:0.625 ms": "0.000625"}[piece.label]
     assert not discovery.added
-    assert discovery_verdicts(discovery)[0].text.startswith("The model lacks physics steps of ")
+    assert discovery_verdicts(discovery)[0].text.startswith("The logs support physics steps of ")
     assert f'timestep="{seconds}"' in (tmp_path / "out" / "discovered.xml").read_text(encoding="utf-8")
     again = run(tmp_path / "out" / "discovered.toml", out=tmp_path / "again", num_threads=1)
     assert {p.name: p.mode for p in again.parameters} == pytest.approx(dict(discovery.best), rel=1e-3)

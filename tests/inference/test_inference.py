@@ -9,11 +9,12 @@ import pytest
 import torch
 
 import sipe_bayes as sipe
+from sipe_bayes.core.budget import BudgetTooSmall
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
-from sipe_bayes.likelihood import BudgetTooSmall, Segments, bind
+from sipe_bayes.likelihood import Segments, bind
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.pendulums import XML, coloured, log, pendulum
 

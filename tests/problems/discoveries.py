@@ -32,12 +32,11 @@ def piece(name: str, site: str = "hinge", kept: bool = False, **changes: object)
         "label": f"{name}:{site}",
         "sentence": f"{name} at {site}",
         "reference": "somebody 1900",
-        "probability": 0.97 if kept else 0.002,
-        "evidence": 40.0,
-        "held_out": 30.0,
-        "log_score": None,
+        "weight": 1.0 if kept else 0.0,
+        "gain": 40.0,
+        "error": 9.0,
         "kept": kept,
-        "undecided": False,
+        "tied": False,
         "kind": "joint",
         "native": True,
         "nearest": "",
@@ -46,13 +45,13 @@ def piece(name: str, site: str = "hinge", kept: bool = False, **changes: object)
     return Piece(**told | changes)  # type: ignore[arg-type]
 
 
-def row(*labels: str, probability: float = 0.0, yardstick: bool = False) -> StructureRow:
-    """A structure, the plain one without labels."""
-    evidence = 20.0 * len(labels)
-    return StructureRow(labels, labels, evidence, evidence / 2, probability, 100, yardstick)
+def row(*labels: str, weight: float = 0.0, behind: float = 0.0, yardstick: bool = False) -> StructureRow:
+    """A structure, the plain one without labels; of the set that the logs support where it has a weight."""
+    gain = 20.0 * len(labels)
+    return StructureRow(labels, labels, gain / 2, gain, 6.3, behind, 9.0, weight > 0, weight, 100, yardstick)
 
 
-def make_discovery(*pieces: Piece, rows: int = 2) -> Discovery:
+def make_discovery(*pieces: Piece, rows: int = 2, tied: tuple[StructureRow, ...] = ()) -> Discovery:
     """A pendulum with two unknowns and a log each to train and hold out; what was kept has values of 0.1."""
     posterior = make_posterior(ParameterSpace(Parameter(n, 1.0, 2.0, 1.5, "kg") for n in ("mass", "arm")))
     found = [name for p in pieces if p.kept for name in p.parameters]
@@ -61,7 +60,7 @@ def make_discovery(*pieces: Piece, rows: int = 2) -> Discovery:
     return Discovery(
         name="pendulum",
         columns=(),
-        rows=(row("dry friction at hinge", probability=0.97), *[row() for _ in range(rows - 1)]),
+        rows=(row("dry friction at hinge", weight=0.6 if tied else 1.0), *tied, *[row() for _ in range(rows - 1)]),
         pieces=pieces,
         promises=(
             Promise("dry_friction:hinge", "dry friction at hinge", 44.0, True),
@@ -72,7 +71,6 @@ def make_discovery(*pieces: Piece, rows: int = 2) -> Discovery:
         parameters=tuple(summaries(posterior)),
         plain_parameters=tuple(summaries(posterior)),
         added=tuple(summary(name, 0.1) for name in found),
-        cost=6.2,
         best={"mass": 1.2, "arm": 1.6} | dict.fromkeys(found, 0.1),
         errors=tuple(ModelErrors(log, log, "angle", "rad", 0.5, 0.1, 0.05, 0.08, 0.04) for log in ("holdout", "train")),
         comparison=FALLS,

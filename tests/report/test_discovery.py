@@ -18,6 +18,7 @@ from tests.problems.discoveries import LARGE, SMALL, make_discovery, piece, row
 
 FRICTION = piece("friction", kept=True)
 LAW = piece("stribeck", kept=True, native=False, nearest="LuGre", parameters=("hinge.size", "hinge.speed"))
+TWIN = row("drag at hinge", weight=0.4, behind=4.0)
 GAINS = piece("gain", "motor", kept=True, parameters=tuple(f"motor.gain[{k}]" for k in range(6)))
 
 CUT = finding(Code.STRUCTURES_CUT_SHORT, budget=30000, larger=60000, before="any piece was tried", untried="")
@@ -40,13 +41,12 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
     "found": (
         make_discovery(FRICTION),
         "good",
-        "lacks friction at hinge, 0.1000 N m (0.0920 to 0.1080), with",
+        "The logs support friction at hinge, 0.1000 N m (0.0920 to 0.1080): the log predictive density rises by 20",
     ),
-    "probable": (make_discovery(FRICTION), "good", "with probability 0.97."),
     "two numbers": (make_discovery(LAW), "good", "size 0.1000 N m (0.0920 to 0.1080) and speed 0.1000 N m ("),
-    "many numbers": (make_discovery(GAINS), "good", "and 3 more, with probability"),
-    "two pieces": (make_discovery(FRICTION, LAW), "good", "0.97; and stribeck at hinge, size"),
-    "found, wrong": (changed(FRICTION, **left(LARGE)), "fair", "The model lacks friction at hinge"),
+    "many numbers": (make_discovery(GAINS), "good", "and 3 more: the log"),
+    "two pieces": (make_discovery(FRICTION, LAW), "good", "0.1080); and stribeck at hinge, size"),
+    "found, wrong": (changed(FRICTION, **left(LARGE)), "fair", "The logs support friction at hinge"),
     "nothing": (make_discovery(), "good", "Nothing is lacking that these logs would show."),
     "nothing, wrong": (changed(**left(LARGE)), "bad", "nothing that was tried is what the model lacks"),
     "a column": (
@@ -62,30 +62,25 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
     "worse": (changed(FRICTION, comparison=Comparison(0.5, 0.4, 0.6, 1e-4, 20)), "bad", "LARGER, 2.00 times"),
     "not better": (changed(FRICTION, comparison=Comparison(1.2, 0.9, 1.6, 0.2, 20)), "fair", "NOT shown to be better"),
     "no log held out": (changed(FRICTION, comparison=None, errors=()), "fair", "No log was held out"),
-    "open": (
-        make_discovery(FRICTION, piece("drag", probability=0.3)),
+    "a tie": (
+        make_discovery(FRICTION, tied=(TWIN,)),
         "fair",
-        "drag at hinge (probability 0.30);",
+        "Not distinguishable from it: drag at hinge (difference -4.0 ± 9.0 nats). The simplest of them, dry friction "
+        "at hinge, is written to discovered.xml. More logs, or other motions, may tell.",
     ),
-    "contradiction": (
-        make_discovery(piece("cogging", undecided=True, evidence=27.0, held_out=-2.2)),
-        "fair",
-        "cogging at hinge (evidence +27 nats, but held-out pieces -2.2); more or longer logs would tell.",
-    ),
-    "contradiction, parts of the logs": (
-        changed(
-            piece("cogging", undecided=True),
-            findings=(finding(Code.SEARCHED_ON_PARTS, used=10.0, all=24.0),),
+    "a tie, parts of the logs": (
+        dataclasses.replace(
+            make_discovery(FRICTION, tied=(TWIN,)), findings=(finding(Code.SEARCHED_ON_PARTS, used=10.0, all=24.0),)
         ),
         "fair",
-        "logs cut to where it shows, or other motions, would tell.",
+        "Logs cut to where they differ, or other motions, may tell.",
     ),
     "noise": (make_discovery(FRICTION), "good", "What remains passes for noise (p = 0.4)."),
     "share": (make_discovery(FRICTION), "good", "Pieces with a name explain 80 %"),
     "small": (changed(FRICTION, **left(SMALL)), "fair", "something small, like drag at hinge"),
     "large": (changed(FRICTION, **left(LARGE)), "bad", "it looks most like drag at hinge"),
     "unknown": (changed(FRICTION, **left(None)), "fair", "cannot be told"),
-    "trusted": (make_discovery(FRICTION), "good", "Values may be trusted within the intervals averaged"),
+    "trusted": (make_discovery(FRICTION), "good", "Values may be trusted within the intervals stacked"),
     "small, trusted": (changed(FRICTION, **left(SMALL)), "good", "Values may be trusted within"),
     "not trusted": (changed(FRICTION, **left(LARGE)), "bad", "No value may be trusted within its interval yet"),
     "unknown, not trusted": (changed(FRICTION, **left(None)), "bad", "No value may be trusted within its interval yet"),
@@ -111,7 +106,7 @@ def test_verdicts(discovery: Discovery, tone: str, words: str) -> None:
     assert [verdict.tone for verdict in said] == [tone], [verdict.text for verdict in discovery_verdicts(discovery)]
 
 
-def test_a_piece_that_is_out_of_the_question_is_not_open() -> None:
+def test_what_is_clearly_behind_is_no_tie() -> None:
     sentences = [v.text for v in discovery_verdicts(make_discovery(FRICTION, piece("drag")))]
     assert not [text for text in sentences if "drag" in text]
 
@@ -128,16 +123,15 @@ NEXT = {
 @pytest.mark.parametrize(("discovery", "words"), NEXT.values(), ids=NEXT)
 def test_what_to_do_next(discovery: Discovery, words: str) -> None:
     assert words in next_steps(discovery)
-    assert "with probability" not in next_steps(discovery)
+    assert "that structure alone" not in next_steps(discovery)
 
 
 def test_a_structure_that_may_be_another_is_not_calibrated_without_a_word() -> None:
-    unsure = make_discovery(dataclasses.replace(FRICTION, probability=0.57))
-    assert next_steps(unsure).endswith("with probability 0.57: use those above")
+    assert next_steps(make_discovery(FRICTION, tied=(TWIN,))).endswith("for that structure alone: use those above")
 
 
 def test_twenty_lines_hold_whatever_there_is_to_say(capsys: pytest.CaptureFixture[str]) -> None:
-    full = make_discovery(FRICTION, LAW, GAINS, *[piece(f"drag{k}", probability=0.3) for k in range(9)], rows=12)
+    full = make_discovery(FRICTION, LAW, GAINS, rows=12, tied=(TWIN,) * 9)
     full = dataclasses.replace(
         full,
         columns=("a", "b"),
@@ -154,8 +148,8 @@ def test_twenty_lines_hold_whatever_there_is_to_say(capsys: pytest.CaptureFixtur
     assert lines[-1].startswith("next: ")
 
 
-def test_a_yardstick_has_no_probability(capsys: pytest.CaptureFixture[str]) -> None:
-    discovery = changed(FRICTION, rows=(row("friction", probability=1.0), row("residual", yardstick=True)))
+def test_a_yardstick_has_no_weight(capsys: pytest.CaptureFixture[str]) -> None:
+    discovery = changed(FRICTION, rows=(row("friction", weight=1.0), row("residual", yardstick=True)))
     print_discovery(discovery)
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  residual")]
     assert line.split()[-1] == "–"
@@ -164,7 +158,8 @@ def test_a_yardstick_has_no_probability(capsys: pytest.CaptureFixture[str]) -> N
 
 def test_page_says_it_all_and_escapes_names() -> None:
     measured = piece("delay", "angle", kept=True, kind="channel", native=False)
-    discovery = changed(FRICTION, LAW, measured, piece("drag", probability=0.3), name=EVIL, columns=(EVIL,))
+    made = make_discovery(FRICTION, LAW, measured, tied=(TWIN,))
+    discovery = dataclasses.replace(made, name=EVIL, columns=(EVIL,))
     images = discovery_pictures(discovery)
     assert {image.section for image in images} == {"signals_holdout", "signals_train", "residuals", "values"}
     html = render_discovery(discovery, images)
@@ -173,11 +168,11 @@ def test_page_says_it_all_and_escapes_names() -> None:
     for verdict in discovery_verdicts(discovery):
         assert verdict.text in page.text
     for words in (
-        "each piece pays 6.2 nats",
+        "Structures within two standard errors of the best predict alike",
         "MJCF has no element for stribeck at hinge",
         "The nearest element is LuGre",
         "Delay at angle is of the measurement and has no place in discovered.xml",
-        "Not decided: drag at hinge: probability 0.30",
+        "Not distinguishable from it: drag at hinge (difference -4.0 ± 9.0 nats)",
         "a spring at hinge +2.0 not to its end",
         "Next: sipe calibrate runs/pendulum-discover/discovered.toml",
     ):

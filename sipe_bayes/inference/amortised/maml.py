@@ -32,6 +32,7 @@ from torch import Generator, Tensor, from_numpy, nn
 from torch.func import functional_call, grad, vmap
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.budget import BudgetExhausted
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.seeding import seed_integer
@@ -44,7 +45,6 @@ from sipe_bayes.inference.amortised.prior_sampling import (
 )
 from sipe_bayes.inference.amortised.simulations import Simulations
 from sipe_bayes.inference.recorded import digest
-from sipe_bayes.likelihood import BudgetExhausted
 from sipe_bayes.models.training import (
     EarlyStopping,
     TrainedNetwork,

@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 from torch import Tensor, from_numpy
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.budget import BudgetExhausted
 from sipe_bayes.core.checkpoint import CheckpointError, Snapshot
 from sipe_bayes.core.findings import Code, p_text
 from sipe_bayes.core.options import Options, option
@@ -51,7 +52,7 @@ from sipe_bayes.inference.amortised.outside import Outside
 from sipe_bayes.inference.amortised.simulations import BLOCK, Cache, Simulations, place_of_invalid
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Recorded, digest
-from sipe_bayes.likelihood import BudgetExhausted, first_states, noise_level
+from sipe_bayes.likelihood import first_states, noise_level
 from sipe_bayes.models.statistics import step_statistics
 from sipe_bayes.models.transitions import SMALLEST, control_steps
 from sipe_bayes.posterior import Posterior

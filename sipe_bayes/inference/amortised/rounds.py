@@ -32,6 +32,7 @@ import torch
 from numpy.typing import NDArray
 
 from sipe_bayes.core.arrays import Float32Array, FloatArray
+from sipe_bayes.core.budget import BudgetExhausted
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.options import option
 from sipe_bayes.core.seeding import torch_generator
@@ -41,7 +42,7 @@ from sipe_bayes.inference.amortised.prior_sampling import PriorSampling, PriorSa
 from sipe_bayes.inference.amortised.simulations import BLOCK, Simulations
 from sipe_bayes.inference.amortised.summaries import REGRESSED, Summaries
 from sipe_bayes.inference.recorded import digest
-from sipe_bayes.likelihood import BudgetExhausted, noise_level
+from sipe_bayes.likelihood import noise_level
 from sipe_bayes.posterior import Averaged, Posterior
 
 _DENSITY_DRAWS = 10_000  # that the truncation's threshold is taken from: 1 / truncated, as it is by default

@@ -16,13 +16,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sipe_bayes.core.budget import BudgetExhausted
 from sipe_bayes.inference import importance
 from sipe_bayes.inference.importance import Draws
 from sipe_bayes.inference.laplace.optimum import WindowOptimum
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, mixture
 from sipe_bayes.inference.laplace.target import WindowFit, WindowTarget
 from sipe_bayes.inference.stretches import look_size, proposals, stretches
-from sipe_bayes.likelihood import BudgetExhausted
 from sipe_bayes.likelihood.windows import Windows
 
 

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.budget import BudgetExhausted, BudgetTooSmall, Deadline
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
@@ -31,7 +32,7 @@ from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, ChainSt
 from sipe_bayes.inference.laplace.state_space.target import ChainFit, ChainTarget
 from sipe_bayes.inference.laplace.strategy import Optimum, SearchProblem, Strategy, distinct, mixture
 from sipe_bayes.inference.laplace.target import Target, WindowFit, WindowTarget
-from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall, Deadline, FitResult, Noise, StateSpace
+from sipe_bayes.likelihood import FitResult, Noise, StateSpace
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.starts.estimates import contacts_of
 from sipe_bayes.likelihood.state_space.chain import Chain

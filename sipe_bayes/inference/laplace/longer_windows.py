@@ -16,11 +16,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.budget import BudgetExhausted
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.inference.laplace.optimum import WindowOptimum, WindowState
 from sipe_bayes.inference.laplace.solver import SegmentSolver
 from sipe_bayes.inference.laplace.strategy import SearchProblem
-from sipe_bayes.likelihood import BudgetExhausted, Segments, bind
+from sipe_bayes.likelihood import Segments, bind
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import tangents

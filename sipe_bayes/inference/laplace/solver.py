@@ -59,6 +59,7 @@ import torch
 from scipy.stats import chi2
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
+from sipe_bayes.core.budget import BudgetExhausted
 from sipe_bayes.core.findings import Code, finding
 from sipe_bayes.inference.laplace.optimum import (
     WindowEnergy,
@@ -76,7 +77,7 @@ from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.quadratic_prior import FLAT_PRECISION
 from sipe_bayes.likelihood.restricted import eliminate_starts, marginal, sandwich
-from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
+from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.wild_samples import wild_residuals
 from sipe_bayes.likelihood.windows import Linearisation, Windows, inward
 

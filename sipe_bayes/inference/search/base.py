@@ -13,6 +13,7 @@ from typing import ClassVar, TypeVar
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from sipe_bayes.core.budget import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
@@ -20,7 +21,6 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Recorded, digest
 from sipe_bayes.inference.search.discrepancy import StateDifference, channel_scale
 from sipe_bayes.inference.search.learned_reward import LearnedReward, RewardOptions
-from sipe_bayes.likelihood import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.models.discriminator import TrainingState
 from sipe_bayes.posterior import Posterior
 

@@ -51,6 +51,7 @@ import torch
 from torch import Tensor
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.budget import BudgetExhausted
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.options import option
 from sipe_bayes.core.seeding import seed_integer, torch_generator
@@ -66,7 +67,7 @@ from sipe_bayes.inference.search.acquisition import (
     ExpectedImprovement,
 )
 from sipe_bayes.inference.search.discrepancy import StateDifference, channel_scale
-from sipe_bayes.likelihood import BoundLikelihood, BudgetExhausted
+from sipe_bayes.likelihood import BoundLikelihood
 from sipe_bayes.models.gaussian_process import GaussianProcess, fit_gaussian_process
 from sipe_bayes.posterior import IndependentPrior, SurrogatePosterior
 from sipe_bayes.posterior.ensemble import EnsembleOptions

@@ -33,18 +33,11 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
+from sipe_bayes.core.budget import BudgetExhausted, Deadline
 from sipe_bayes.core.rotations import written_near
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.likelihood.noise import chosen_sd, noise_scales
-from sipe_bayes.likelihood.settings import (
-    BudgetExhausted,
-    Deadline,
-    StateSpace,
-    check_prompt,
-    check_seen,
-    chosen_channels,
-    fitted_rotations,
-)
+from sipe_bayes.likelihood.settings import StateSpace, check_prompt, check_seen, chosen_channels, fitted_rotations
 from sipe_bayes.likelihood.starts.estimates import estimate_states, start_sd
 from sipe_bayes.likelihood.starts.history import past_commands, with_history
 from sipe_bayes.simulation.simulator import Simulator

@@ -11,8 +11,8 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors
 from sipe_bayes.report.discovery import plots
 from sipe_bayes.report.discovery.words import (
+    alternative_text,
     alternatives,
-    chance,
     discovery_verdicts,
     nats,
     next_steps,
@@ -21,6 +21,8 @@ from sipe_bayes.report.discovery.words import (
     structure_text,
     value_rows,
     warnings,
+    weight_text,
+    with_error,
 )
 from sipe_bayes.report.drawing import png, uncollected
 from sipe_bayes.report.interactive.charts import charts
@@ -71,9 +73,9 @@ def _context(discovery: Discovery, images: Sequence[Picture]) -> Mapping[str, ob
     structures = [
         {
             "what": structure_text(row),
+            "gain": with_error(row.gain, row.error),
             "evidence": nats(row.evidence),
-            "held_out": nats(row.held_out),
-            "probability": chance(row),
+            "weight": weight_text(row),
             "rollouts": f"{row.rollouts:,}",
         }
         for row in discovery.rows
@@ -88,12 +90,11 @@ def _context(discovery: Discovery, images: Sequence[Picture]) -> Mapping[str, ob
         "sentences": sentences[1:],
         "warnings": warnings(discovery),
         "pieces": [piece_text(piece) for piece in discovery.kept],
-        "others": [piece_text(piece) for piece in alternatives(discovery)],
+        "others": [alternative_text(row) for row in alternatives(discovery)],
         "laws": [piece for piece in discovery.kept if not piece.native and piece.kind != "channel"],
         "measured": [piece for piece in discovery.kept if piece.kind == "channel"],
         "references": {piece.sentence: piece.reference for piece in discovery.kept if len(piece.reference) > 1},
         "structures": structures,
-        "cost": nats(discovery.cost).lstrip("+"),
         "promises": [
             {
                 "what": p.sentence,

@@ -5,26 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 from sipe_bayes.core.findings import Code, Findings
-from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors, Piece
 from sipe_bayes.report.verdicts import Verdict
 from sipe_bayes.report.words import correlation_time, error_text, listed, significant, unit_text
 from sipe_bayes.structure.structures import StructureRow
 
-_SURE = 0.995  # a probability from which no more digits are told
 _VALUES, _NAMED = 3, 2  # that a sentence lists
 
 
 def nats(value: float | None) -> str:
     """A gain in nats with its sign; a dash where it is not known."""
     return "–" if value is None else f"{value:+.0f}" if abs(value) >= 10 else f"{value:+.1f}"
-
-
-def probability_text(probability: float) -> str:
-    """A probability to two digits."""
-    if probability > _SURE:
-        return "> 0.99"
-    return f"{probability:.2f}" if probability >= 1 - _SURE else "< 0.01"
 
 
 def found_values(discovery: Discovery, piece: Piece) -> str:
@@ -38,9 +29,14 @@ def found_values(discovery: Discovery, piece: Piece) -> str:
     return listed([*texts, *([f"{len(mine) - _VALUES} more"] if len(mine) > _VALUES else [])])
 
 
-def chance(row: StructureRow) -> str:
-    """The probability of a structure; none of one that is only a yardstick."""
-    return "–" if row.yardstick else probability_text(row.probability)
+def with_error(value: float, error: float) -> str:
+    """A number of nats and its standard error."""
+    return f"{nats(value)} ± {nats(error).lstrip('+')}"
+
+
+def weight_text(row: StructureRow) -> str:
+    """The stacking weight of a structure; none of one outside the set that the logs support."""
+    return f"{row.weight:.2f}" if row.tied else "–"
 
 
 def structure_text(row: StructureRow) -> str:
@@ -48,22 +44,20 @@ def structure_text(row: StructureRow) -> str:
     return listed(row.sentences) or "the model as it was"
 
 
-def scores_text(piece: Piece) -> str:
-    """How much speaks for a piece."""
-    held_out = "" if piece.held_out is None else f", held-out pieces {nats(piece.held_out)}"
-    return f"probability {probability_text(piece.probability)}, evidence {nats(piece.evidence)} nats{held_out}"
-
-
 def piece_text(piece: Piece) -> str:
-    """What may be lacking, and how much speaks for it."""
-    return f"{piece.sentence}: {scores_text(piece)}"
+    """An extension, and by how much it raises the log predictive density."""
+    gain = "" if piece.gain is None or piece.error is None else f": {with_error(piece.gain, piece.error)} nats"
+    return f"{piece.sentence}{gain}"
 
 
-def alternatives(discovery: Discovery) -> tuple[Piece, ...]:
-    """Pieces that the most probable structure does without, and that are not out of the question."""
-    return tuple(
-        p for p in discovery.pieces if not p.kept and (p.undecided or p.probability >= THRESHOLDS.open_structure)
-    )
+def alternatives(discovery: Discovery) -> tuple[StructureRow, ...]:
+    """The structures that the logs do not tell from the one that is written out."""
+    return tuple(row for row in discovery.rows[1:] if row.tied)
+
+
+def alternative_text(row: StructureRow) -> str:
+    """A structure that the logs do not tell apart, and its difference."""
+    return f"{structure_text(row)} (difference {with_error(-row.behind, row.behind_error)} nats)"
 
 
 def column_verdict(discovery: Discovery) -> Verdict | None:
@@ -76,17 +70,16 @@ def column_verdict(discovery: Discovery) -> Verdict | None:
 
 def headline(discovery: Discovery) -> Verdict:
     """What the model lacks, and how much of it."""
-    kept = [
-        ", ".join(filter(None, [p.sentence, found_values(discovery, p), f"with probability {likely}"]))
-        for p, likely in ((p, probability_text(p.probability)) for p in discovery.kept)
-    ]
+    kept = "; and ".join(", ".join(filter(None, [p.sentence, found_values(discovery, p)])) for p in discovery.kept)
     if kept and (cut_short(discovery) or not discovery.settled):
         among = f"Not all of the {len(discovery.rows)} structures were fitted to their end; of these"
         if cut_short(discovery):
             among = f"Of the {len(discovery.rows)} structures that were fitted before the budget was spent"
-        return Verdict("bad", f"{among}, the best has {'; and '.join(kept)} among these.")
+        return Verdict("bad", f"{among}, the best has {kept}.")
     if kept:
-        return Verdict("good" if discovery.passes else "fair", f"The model lacks {'; and '.join(kept)}.")
+        best = discovery.rows[0]
+        gain = f"the log predictive density rises by {with_error(best.gain, best.error).lstrip('+')} nats"
+        return Verdict("good" if discovery.passes else "fair", f"The logs support {kept}: {gain}.")
     if discovery.passes:
         return Verdict("good", "Nothing is lacking that these logs would show.")
     if not discovery.pieces and cut_short(discovery):
@@ -95,8 +88,7 @@ def headline(discovery: Discovery) -> Verdict:
         )
     if cut_short(discovery):
         return Verdict("bad", "The residuals are not noise; of what was fitted nothing is shown to be lacking yet.")
-    tried = "no piece that was tried is shown to be" if alternatives(discovery) else "nothing that was tried is"
-    return Verdict("bad", f"The residuals are not noise, and {tried} what the model lacks.")
+    return Verdict("bad", "The residuals are not noise, and nothing that was tried is what the model lacks.")
 
 
 def held_out_verdict(discovery: Discovery) -> Verdict | None:
@@ -116,24 +108,18 @@ def held_out_verdict(discovery: Discovery) -> Verdict | None:
     return Verdict(*words[comparison.verdict])
 
 
-def undecided(discovery: Discovery) -> Verdict | None:
-    """What is neither in nor out of the question, and what would decide it."""
-    open_pieces = alternatives(discovery)
-    if not open_pieces:
+def ties(discovery: Discovery) -> Verdict | None:
+    """Which structures the logs do not tell apart, and what would."""
+    others = [alternative_text(row) for row in alternatives(discovery)]
+    if not others:
         return None
-    named = [f"{p.sentence} ({_why_open(p)})" for p in open_pieces]
-    more = [f"{len(named) - _NAMED} more"] if len(named) > _NAMED else []
+    more = [f"{len(others) - _NAMED} more"] if len(others) > _NAMED else []
     parts = any(one.code is Code.SEARCHED_ON_PARTS for one in discovery.findings)
-    would = "logs cut to where it shows, or other motions," if parts else "more or longer logs"
-    return Verdict("fair", f"Not decided: {listed([*named[:_NAMED], *more])}; {would} would tell.")
-
-
-def _why_open(piece: Piece) -> str:
-    if piece.undecided:
-        pieces = piece.held_out is not None and piece.held_out <= 0
-        against = f"pieces {nats(piece.held_out)}" if pieces else f"logs {nats(piece.log_score)}"
-        return f"evidence {nats(piece.evidence)} nats, but held-out {against}"
-    return f"probability {probability_text(piece.probability)}"
+    would = "Logs cut to where they differ, or other motions," if parts else "More logs, or other motions,"
+    written = f"The simplest of them, {structure_text(discovery.rows[0])}, is written to discovered.xml."
+    return Verdict(
+        "fair", f"Not distinguishable from it: {listed([*others[:_NAMED], *more])}. {written} {would} may tell."
+    )
 
 
 def remains(discovery: Discovery) -> Verdict | None:
@@ -153,7 +139,7 @@ def remains(discovery: Discovery) -> Verdict | None:
 
 
 def trust(discovery: Discovery) -> Verdict:
-    """Which intervals hold: those averaged over the structures, once residuals pass and the search has settled."""
+    """Which intervals hold: those stacked over the structures, once residuals pass and the search has settled."""
     cut = cut_short(discovery)
     usable = discovery.kept and discovery.best_settled and any(p.further is not None for p in discovery.parameters)
     if cut is not None and usable:
@@ -163,7 +149,7 @@ def trust(discovery: Discovery) -> Verdict:
     if not discovery.settled:
         return Verdict("bad", "No value may be trusted yet: the search ended before it had settled; raise its budget.")
     if discovery.passes:
-        return Verdict("good", "Values may be trusted within the intervals averaged over the structures, no narrower.")
+        return Verdict("good", "Values may be trusted within the intervals stacked over the structures, no narrower.")
     if any(p.further is not None for p in discovery.parameters):
         text = "Use values within the intervals with what the model lacks: the plain ones are those of models that are"
         return Verdict("fair", f"{text} still wrong.")
@@ -173,7 +159,7 @@ def trust(discovery: Discovery) -> Verdict:
 
 def discovery_verdicts(discovery: Discovery) -> list[Verdict]:
     """The answer: at the top of the report, and at the end of what is printed."""
-    out = [column_verdict(discovery), headline(discovery), held_out_verdict(discovery), undecided(discovery)]
+    out = [column_verdict(discovery), headline(discovery), held_out_verdict(discovery), ties(discovery)]
     return [verdict for verdict in (*out, remains(discovery), trust(discovery)) if verdict is not None]
 
 
@@ -181,10 +167,9 @@ def next_steps(discovery: Discovery) -> str:
     """What to do with it."""
     out = Path(discovery.out)
     if discovery.kept or discovery.columns:
-        least = min((piece.probability for piece in discovery.kept), default=1.0)
-        alone = f"; its intervals hold if that is so, with probability {probability_text(least)}: use those above"
+        alone = "; its intervals hold for that structure alone: use those above"
         onward = f"sipe calibrate {out / 'discovered.toml'} (the model with these values: {out / 'discovered.xml'})"
-        return onward + alone * (least < THRESHOLDS.shown_interval)
+        return onward + alone * bool(alternatives(discovery))
     if cut_short(discovery):
         return "search again with a larger budget, as said above"
     if discovery.passes:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.budget import BudgetExhausted, Deadline
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
@@ -13,7 +14,7 @@ from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.laplace.options import LaplaceTuning, SolverTuning
 from sipe_bayes.inference.laplace.solver import SegmentSolver, SolverState, is_back, spread_segments
-from sipe_bayes.likelihood import BudgetExhausted, Deadline, Segments, StateSpace, bind
+from sipe_bayes.likelihood import Segments, StateSpace, bind
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.simulation.prompt import PromptSimulator, prompt
 from sipe_bayes.simulation.simulator import Simulator
@@ -146,7 +147,9 @@ def test_long_logs_are_fitted_in_part() -> None:
 
 
 @pytest.mark.parametrize(("seconds", "window", "share"), [(80.0, 1.0, 0.25), (80.0, None, 0.25), (8.0, 1.0, 1.0)])
-def test_a_fit_begins_on_a_quarter_that_holds_enough_samples(seconds: float, window: float | None, share: float) -> None:
+def test_a_fit_begins_on_a_quarter_that_holds_enough_samples(
+    seconds: float, window: float | None, share: float
+) -> None:
     """Of several segments a quarter of them, of one its beginning; of 400 samples, 100 a parameter, all."""
     method = Laplace(servo(), likelihood=Segments(window=window))
     bound = bind(method.likelihood, method.simulator, method_logs(recorded(1, seconds)))

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.budget import BudgetExhausted
 from sipe_bayes.inference import importance
 from sipe_bayes.inference.importance import Draws
 from sipe_bayes.inference.laplace.state_space.target import ChainTarget
 from sipe_bayes.inference.laplace.strategy import SearchProblem
 from sipe_bayes.inference.stretches import look_size, proposals, stretches
-from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.posterior import GaussianMixture
 
 

@@ -18,6 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sipe_bayes.core.budget import BudgetExhausted
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.inference.laplace.state_space.noise import NoisePosterior, excess, infer_noise
 from sipe_bayes.inference.laplace.state_space.smoother import smooth, solvable
@@ -29,7 +30,6 @@ from sipe_bayes.inference.laplace.state_space.state import (
     evidence,
     optimum_at,
 )
-from sipe_bayes.likelihood.settings import BudgetExhausted
 from sipe_bayes.likelihood.state_space.differences import linearise_by
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states
 

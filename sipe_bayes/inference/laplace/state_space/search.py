@@ -29,6 +29,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.budget import BudgetExhausted
 from sipe_bayes.inference.laplace.longer_windows import trailed
 from sipe_bayes.inference.laplace.state_space.kalman_filter import filtered
 from sipe_bayes.inference.laplace.state_space.noise import (
@@ -51,7 +52,7 @@ from sipe_bayes.inference.laplace.state_space.state import (
     screened,
     unknown_noise,
 )
-from sipe_bayes.likelihood.settings import BudgetExhausted, Segments
+from sipe_bayes.likelihood.settings import Segments
 from sipe_bayes.likelihood.state_space.differences import linearise
 from sipe_bayes.likelihood.state_space.linearisation import ChainLinearisation, ChainNoise, eliminate_states
 

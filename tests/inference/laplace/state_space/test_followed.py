@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sipe_bayes.core.budget import BudgetTooSmall
 from sipe_bayes.inference.laplace.estimator import Laplace
-from sipe_bayes.likelihood.settings import BudgetTooSmall, StateSpace
+from sipe_bayes.likelihood.settings import StateSpace
 from tests.problems.hung import hung, hung_log
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import sipe_bayes as sipe
+from sipe_bayes.core.budget import BudgetExhausted
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
@@ -17,7 +18,7 @@ from sipe_bayes.inference.laplace.state_space.search import StateSpaceSearch
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum, ChainState
 from sipe_bayes.inference.mcmc import MCMC
 from sipe_bayes.likelihood.binding import bind
-from sipe_bayes.likelihood.settings import BudgetExhausted, StateSpace
+from sipe_bayes.likelihood.settings import StateSpace
 from sipe_bayes.likelihood.state_space.linearisation import ChainNoise
 from sipe_bayes.likelihood.state_space.process_noise import process_noise_findings
 from sipe_bayes.simulation.simulator import Simulator

@@ -1,0 +1,88 @@
+r"""Structures compared by what they predict of pieces that they have not seen, with standard errors.
+
+The difference of two structures is the sum of the K pieces' differences d_k of log predictive density (A. Vehtari, A.
+Gelman, J. Gabry 2017, https://doi.org/10.1007/s11222-016-9696-4). Its standard error is
+
+.. math:: s^2 = \frac{1 + r}{1 - r} \Big( 2 \sum_k \varphi_k |d_k| + 2 \sum_{k: d_k < 0} d_k^2 \Big)
+
+if the sum is positive: if the first structure is right, d_k has the mean m_k and the variance 2 m_k of a log likelihood
+ratio of normal distributions; phi_k is the mean square of its whitened residuals in the piece, if that is above one. A
+piece that speaks against the sum has a twin that speaks for it by chance. Neighbouring pieces of a log differ alike by
+the correlation r: what counts is the effective number of pieces.
+
+Deviation from Vehtari et al., whose s^2 = K var(d): motions differ in what they tell, and a sum of gains that all have
+one sign, but differ, is no uncertain one.
+
+Structures within two standard errors of the best are **ties**. The set that is reported are those ties of which no
+part is a tie itself: an extension that is not needed is not reported. **Stacking weights** of a set maximise the mean
+log of the weighted mixture (Y. Yao, A. Vehtari, D. Simpson, A. Gelman 2018, https://doi.org/10.1214/17-BA1091).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.structure.fitted import FittedStructure
+
+_ERRORS = 2.0  # standard errors within which structures are ties
+_ALIKE = 0.5  # largest correlation of neighbours: motions that tell more follow each other, too
+_ROUNDS = 200  # of the weights' iteration, which never lowers what it maximises
+
+
+class Difference(NamedTuple):
+    """Of two structures, in nats: how much better the first one predicts, and the standard error of that."""
+
+    nats: float
+    error: float
+
+    @property
+    def clear(self) -> bool:
+        """Whether the first one predicts better by more than two standard errors."""
+        return self.nats > _ERRORS * self.error
+
+
+def difference(one: FittedStructure, other: FittedStructure) -> Difference:
+    """How much better a structure predicts than another; by their evidence where the logs have no pieces."""
+    if not len(one.held.density):
+        gain = one.evidence - other.evidence
+        return Difference(gain, float(np.sqrt(2 * abs(gain))))
+    if not np.isfinite(one.held.density).all() or not np.isfinite(other.held.density).all():
+        worse, better = (bool(np.isneginf(each.held.density).any()) for each in (one, other))
+        return Difference(0.0 if worse == better else -np.inf if worse else np.inf, 0.0)
+    each = one.held.density - other.held.density
+    total = float(each.sum())
+    opposing, follows = each[each * total < 0], one.held.log[1:] == one.held.log[:-1]
+    apart = each - each.mean()
+    alike = float(apart[1:][follows] @ apart[:-1][follows]) / max(float(apart @ apart), 1e-300)
+    alike = min(max(alike, 0.0), _ALIKE)
+    square = 2 * float(_mean_squares(one if total > 0 else other) @ np.abs(each)) + 2 * float(opposing @ opposing)
+    return Difference(total, float(np.sqrt(square * (1 + alike) / (1 - alike))))
+
+
+def _mean_squares(one: FittedStructure) -> FloatArray:
+    """Of a structure's whitened residuals in each piece (K,), at least one; over all pieces it is one."""
+    density, _, samples = one.held
+    return np.maximum(1 + 2 * (density.sum() / samples.sum() - density / samples), 1.0)
+
+
+def choose_ties(structures: Sequence[FittedStructure]) -> list[FittedStructure]:
+    """The structures within two standard errors of the best one, without those of which a part is a tie as well."""
+    best = max(structures, key=lambda one: difference(one, structures[0]).nats)
+    ties = [one for one in structures if one is best or not difference(best, one).clear]
+    return [one for one in ties if not any(set(other.labels) < set(one.labels) for other in ties)]
+
+
+def stack(structures: Sequence[FittedStructure]) -> FloatArray:
+    """Stacking weights (S,) of structures."""
+    weight = np.full(len(structures), 1 / len(structures))
+    if not len(structures[0].held.density):
+        return weight
+    densities = np.stack([one.held.density for one in structures], axis=1)
+    densities = np.exp(densities - densities.max(1, keepdims=True))
+    for _ in range(_ROUNDS):
+        weight = weight * (densities / (densities @ weight)[:, None]).mean(0)
+    return weight / weight.sum()
