@@ -37,7 +37,6 @@ from _kept import fits, keep
 import sipe_bayes as sipe
 from sipe_bayes.core.files import write_text
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood import BoundLikelihood, Segments
@@ -201,9 +200,10 @@ def searched(name: str, effect: str, size: str, noise: str, seed: int) -> dict[s
         "seed": seed,
         "planted": label,
         "named": list(best.labels),
-        "probability": row.probability,
-        "inclusion": {k: v for k, v in structures.inclusion().items() if v > 0.01},
-        "evidence": row.evidence,
+        "set": [list(one.labels) for one in structures.supported],
+        "weights": [r.weight for r in structures.table() if r.tied],
+        "gain": row.gain,
+        "error": row.error,
         "offers": [[o.label, round(o.gain, 2)] for o in structures.offers()[:6]],
         "inside": inside,
         "logs": len(fitting.trajectories),
@@ -213,8 +213,8 @@ def searched(name: str, effect: str, size: str, noise: str, seed: int) -> dict[s
 
 
 def answer(row: dict[str, Any]) -> list[str]:
-    """The extensions that a search names, most probable first."""
-    return [label for label, p in row["inclusion"].items() if p >= THRESHOLDS.open_structure]
+    """The extensions of the set that a search reports, those of the structure that is written out first."""
+    return list(dict.fromkeys(label for labels in row["set"] for label in labels))
 
 
 def shares(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -291,7 +291,7 @@ def main() -> None:
             rows.append(row)
             print(
                 f"{name:9s} {row['planted'] or 'null':28s} {size:6s} {noise:5s} {answer(row)} "
-                f"{row['evidence']:.1f} {row['seconds']:.0f} s",
+                f"{row['gain']:.1f} ± {row['error']:.1f} {row['seconds']:.0f} s",
                 flush=True,
             )
             write_text(HERE / "results" / "discover.json", json.dumps(tables(rows), indent=1) + "\n")

@@ -54,11 +54,12 @@ def studied(name: str) -> dict[str, Any]:
     before, after = calibrated(config), calibrated(out / DISCOVERED_TOML)
     return {
         "found": list(best.sentences),
-        "probability": best.probability,
-        "evidence": best.evidence,
-        "held-out score": best.held_out,
+        "weight": best.weight,
+        "gain": best.gain,
+        "error": best.error,
         "others": [
-            {"sentences": r.sentences, "evidence": r.evidence, "held-out score": r.held_out} for r in others[:5]
+            {"sentences": r.sentences, "gain": r.gain, "error": r.error, "behind": r.behind, "tied": r.tied}
+            for r in others[:5]
         ],
         "held-out error before": errors(before),
         "held-out error after": errors(after),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +33,18 @@ class Sequence:
     def coefficients(self, tau: float) -> FloatArray:
         """Autoregression coefficient (n,) of each row; see ``coefficients``."""
         return coefficients(self.gaps, tau)[self.gap]
+
+
+def cut(sequence: Sequence, first: IntArray) -> Sequence:
+    """A sequence of which the rows of some windows, ``first``, do not depend on the row of the window before."""
+    apart = sequence.crosses & np.isin(sequence.window, first)
+    begin = len(sequence.gaps) - 1  # infinite
+    return replace(
+        sequence,
+        previous=np.where(apart, -1, sequence.previous),
+        crosses=sequence.crosses & ~apart,
+        gap=np.where(apart, begin, sequence.gap),
+    )
 
 
 def coefficients(gaps: FloatArray, tau: float | FloatArray) -> FloatArray:

@@ -33,7 +33,7 @@ from sipe_bayes.likelihood.block_tridiagonal import Eliminated
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_level, noise_scales, pooled, whiten
 from sipe_bayes.likelihood.restricted import Pulls, eliminate_starts, estimate_noise, marginal
-from sipe_bayes.likelihood.sequences import Sequence, compared_samples, reached, sequences, spread_blocks
+from sipe_bayes.likelihood.sequences import Sequence, compared_samples, cut, reached, sequences, spread_blocks
 from sipe_bayes.likelihood.settings import Segments, chosen_channels, fitted_rotations
 from sipe_bayes.likelihood.starts.estimates import (
     STATE_STEP,
@@ -277,6 +277,12 @@ class Windows:
         view.observed = view.observed if observed is None else observed
         view._masked = 0
         return view._in_order()
+
+    def cut(self, first: IntArray) -> Windows:
+        """These windows, whose noise at the beginning of some, ``first``, does not depend on what was before."""
+        view = copy.copy(self)
+        view.sequences = [cut(sequence, first) for sequence in self.sequences]
+        return view
 
     @contextmanager
     def counting(self, view: Windows) -> Iterator[None]:

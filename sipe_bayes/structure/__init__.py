@@ -1,8 +1,8 @@
-"""What a model may lack: extensions (a file each), what they promise, their scores, and the search over them.
+"""What a model may lack: extensions (a file each), their predicted gains, comparison, and the search.
 
-``discover`` fits the user's model, tests what every extension would add, fits those that promise most, keeps what both
-the evidence and held-out pieces of the logs keep, and returns ``Structures``: a distribution over structures, and the
-posterior of the user's parameters averaged over it.
+``discover`` fits the user's model, ranks all extensions by a score test, fits the best few beside the best structures,
+and compares them by what they predict of held-out pieces. It returns ``Structures``: the set that the logs support, and
+the posterior of the user's parameters stacked over it.
 """
 
 from sipe_bayes.structure.discover import Restriction, discover

@@ -65,7 +65,7 @@ def difference(one: FittedStructure, other: FittedStructure) -> Difference:
 
 def _mean_squares(one: FittedStructure) -> FloatArray:
     """Of a structure's whitened residuals in each piece (K,), at least one; over all pieces it is one."""
-    density, _, samples = one.held
+    density, samples = one.held.density, one.held.samples
     return np.maximum(1 + 2 * (density.sum() / samples.sum() - density / samples), 1.0)
 
 

@@ -18,15 +18,13 @@ linear around its optimum.
 
 Deviations:
 
-- The noise is that of the fit to all training logs.
-- Across a piece's edge the first sample behind it is still whitened with the last one of the piece.
+- The noise is that of the fit to all training logs. Pieces are compared as if noise began anew in each.
 - Directions that the data leave open get the flat normal of ``likelihood.quadratic_prior``.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -37,7 +35,8 @@ from sipe_bayes.posterior.truncated_normal import TruncatedNormal
 _PIECES = 40  # of all logs together, at most
 
 
-class Pieces(NamedTuple):
+@dataclass(frozen=True)
+class Pieces:
     """Log predictive densities (K,) in nats of pieces, which log each is of (K,), and how many samples it has (K,)."""
 
     density: FloatArray
@@ -83,12 +82,16 @@ def scores(
     # one block for each window also where starts are known
     moments = windows.moments(linearisation)
     products, constants = moments.normal(noise), _log_determinants(windows, noise)
-    linear = _Linear(windows, theta, starts, prior)
-    whole, parts = linear.evidence(products, float(constants.sum())), _parts(windows)
+    evidence = _Linear(windows, theta, starts, prior).evidence(products, float(constants.sum()))
+    parts = _parts(windows)
     if len(parts) < 2 or len(products) < len(windows.log):
-        return Scores(whole, _pieces(windows, [], np.zeros(0)))
+        return Scores(evidence, _pieces(windows, [], np.zeros(0)))
+    windows = windows.cut(np.array([part.argmax() for part in parts]))
+    products, constants = windows.moments(linearisation).normal(noise), _log_determinants(windows, noise)
+    linear = _Linear(windows, theta, starts, prior)
+    whole = linear.evidence(products, float(constants.sum()))
     without = [linear.evidence_of(products, constants, ~part) for part in parts]
-    return Scores(whole, _pieces(windows, parts, whole - np.array(without)))
+    return Scores(evidence, _pieces(windows, parts, whole - np.array(without)))
 
 
 def predictive(windows: BoundLikelihood, theta: FloatArray, noise: Noise, posterior: QuadraticPrior) -> Pieces:
@@ -117,6 +120,8 @@ def predictive(windows: BoundLikelihood, theta: FloatArray, noise: Noise, poster
         return _pieces(windows, parts, np.full(len(parts), -np.inf))
     pulls = windows.pulls(posterior.precision, posterior.pull(theta), starts)
     noise = windows.estimate_noise(moments, noise, pulls, True)
+    windows = windows.cut(np.array([part.argmax() for part in parts]))
+    moments = windows.moments(linearisation)
     products, constants = moments.normal(noise), _log_determinants(windows, noise)
     linear = _Linear(windows, theta, starts, posterior)
     density = [linear.evidence_of(products, constants, part) for part in parts]

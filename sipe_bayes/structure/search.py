@@ -16,8 +16,9 @@ r"""The search over structures: what fits best is extended, round by round; then
                                                 DONE
 
 **Judgement** is ``comparison``'s alone: a structure is extended where it predicts pieces that it has not seen clearly
-better than all that it contains, and is not clearly behind the best one. An extension is fitted from a predicted gain
-of five nats on: one that gains less than eight in the end is never clear of its own standard error.
+better than all that it contains, and is not clearly behind the best one. For a single extension one standard error is
+enough: an effect may be clear only beside another. An extension is fitted from a predicted gain of five nats on: one
+that gains less than eight in the end is never clear of its own standard error.
 """
 
 from __future__ import annotations
@@ -207,7 +208,8 @@ class StructureSearch:
     def _queue(self, state: DiscoverState) -> tuple[tuple[str, ...], ...]:
         """The structures with the largest predicted gains, beside what their part gains already; no tried ones.
 
-        Beside the model as it is, as many again whose predicted gains are the same to two standard errors.
+        Beside the model as it is, as many again whose predicted gains are the same to two standard errors. Shorter
+        integration steps always: what long ones do looks like a delay, a filter or a spring.
         """
         options, plain, queue = self.options, state.fitted[0], dict[frozenset[str], tuple[float, tuple[str, ...]]]()
         for labels in state.beam:
@@ -221,8 +223,10 @@ class StructureSearch:
         ranked = sorted(queue.values(), key=lambda item: -item[0])
         level = ranked[0][0] - 2 * math.sqrt(2 * max(ranked[0][0], 0.0)) if ranked else 0.0
         most = 2 * options.width if state.beam == ((),) else options.width
-        close = [item for item in ranked[options.width : most] if item[0] >= level]
-        return tuple(grown for _, grown in ranked[: options.width] + close)
+        close = [(gain, grown) for gain, grown in ranked[options.width : most] if gain >= level]
+        chosen = [grown for _, grown in ranked[: options.width] + close]
+        steps = [grown for _, grown in ranked if grown[-1] in self._ladder.labels and grown not in chosen]
+        return (*chosen, *steps)
 
     def _grown(self, offer: Offer) -> tuple[str, ...]:
         """Labels of a structure with what was offered beside it; shorter steps take the place of longer ones."""
@@ -275,7 +279,7 @@ class StructureSearch:
         """Labels of the best new structures that are clearly better than what they contain, and not clearly behind."""
         plain, best = state.fitted[0], self._best(state)
         new = [one for one in state.fitted if one.labels not in state.ranked and not difference(best, one).clear]
-        better = [one for one in new if all(difference(one, part).clear for part in _parts(state, one))]
+        better = [one for one in new if all(_is_better(one, part) for part in _parts(state, one))]
         better.sort(key=lambda one: -difference(one, plain).nats)
         return tuple(one.labels for one in better[: self.options.beam])
 
@@ -330,6 +334,12 @@ class StructureSearch:
             spent = state.failed_rollouts + one.rollouts
             return replace(state, failed=(*state.failed, labels), failed_rollouts=spent, cut=cut)
         return replace(state, fitted=(*state.fitted, one), cut=cut)
+
+
+def _is_better(one: FittedStructure, part: FittedStructure) -> bool:
+    """Whether a structure is clearly better than its part; for a single extension one standard error is enough."""
+    gain = difference(one, part)
+    return gain.clear or (len(one.labels) == 1 and gain.nats > gain.error)
 
 
 def _parts(state: DiscoverState, one: FittedStructure) -> list[FittedStructure]:

@@ -111,7 +111,8 @@ def search_of(*fitted: FittedStructure) -> tuple[StructureSearch, list[FittedStr
         assert initial.tolist() == [0.5, *(ord(x) / 1000 for x in labels)]
         one = next(x for x in fitted if set(x.labels) == set(labels))
         asked.append(one)
-        return replace(state, fitted=(*state.fitted, replace(one, labels=labels)))
+        theta = structure("".join(labels)).theta
+        return replace(state, fitted=(*state.fitted, replace(one, labels=labels, theta=theta)))
 
     mock.patch.object(search, "_fitted", fit).start()
     return search, asked
@@ -123,7 +124,7 @@ def offer(at: str, label: str, gain: float) -> Offer:
 
 def test_a_beam_finds_what_the_first_choice_hides() -> None:
     """Alone, c predicts best; with a and b it is not needed. Each smaller structure of the best one is fitted."""
-    gains = {"": 0.0, "a": 8.0, "b": 1.0, "c": 9.0, "ac": 11.0, "bc": 9.5, "ab": 15.0, "d": 0.0}
+    gains = {"": 0.0, "a": 8.5, "b": 1.0, "c": 9.0, "ac": 11.0, "bc": 9.5, "ab": 15.0, "d": 0.0}
     search, asked = search_of(*(structure(x, *np.full(10, gain)) for x, gain in gains.items()))
     offers = [offer("", x, 10 * gains[x]) for x in "abcd"]
     offers += [offer("a", "b", 70.0), offer("a", "c", 30.0), offer("c", "a", 20.0), offer("c", "b", 5.5)]

@@ -113,6 +113,17 @@ def test_held_out_pieces_are_foretold_as_by_refitting(logs: int) -> None:
     assert got == pytest.approx(expected, abs=0.05)
 
 
+@pytest.mark.parametrize("rho", [0.0, 0.3, 0.9])
+def test_what_pieces_are_given_does_not_depend_on_how_noise_follows_itself(rho: float) -> None:
+    """Of white noise, told to be coloured: a piece never knows the sample behind its end."""
+    windows = bound([OFFSET], 0.0)
+    noise = Noise(np.array([SD]), np.array([-DT / np.log(rho) if rho else 0.0]))
+    prior = QuadraticPrior.of(default_prior(windows.simulator.space))
+    both = scores(windows, np.full(1, 0.4), windows.no_starts(), noise, prior)
+    print(both.pieces.density.sum() - both.evidence)
+    assert both.pieces.density.sum() - both.evidence == pytest.approx(-0.1, abs=0.3)  # 2 nats and more if it knew it
+
+
 def test_importance_sampling_gives_the_evidence_of_a_pendulum_with_friction() -> None:
     """400 draws about the optimum, starts integrated out: what is not normal, friction's kink, is half a nat."""
     simulator = pendulum(Parameter("friction", 0.0, 0.3, targets=("joint:hinge.frictionloss",)))
