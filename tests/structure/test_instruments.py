@@ -13,7 +13,7 @@ from sipe_bayes.likelihood import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import extended, members, placements
-from sipe_bayes.structure.extensions.world.sensor_delay import SensorDelay
+from sipe_bayes.structure.extensions.world import SensorDelay
 from sipe_bayes.structure.machine import machine_of
 
 BLIMP = """<mujoco><option timestep="0.01"/><worldbody><body name="hull" gravcomp="1"><freejoint/>

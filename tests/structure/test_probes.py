@@ -17,8 +17,8 @@ from sipe_bayes.posterior import prior
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure import Restriction, discover
 from sipe_bayes.structure.extension import Extension, members, placements
-from sipe_bayes.structure.extensions.actuator.lag import FilteredCommand, Lag
-from sipe_bayes.structure.extensions.world.sensor_filter import SensorFilter
+from sipe_bayes.structure.extensions.actuator import FilteredCommand, Lag
+from sipe_bayes.structure.extensions.world import SensorFilter
 from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.probes import effects, imitating
 from tests.problems.machines import MACHINES, environment

@@ -1,4 +1,4 @@
-"""A spring along a tendon, as a cable that stretches over a return spring, with the length at which it rests."""
+"""Extensions at a tendon."""
 
 from __future__ import annotations
 
@@ -8,6 +8,50 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.structure.extension import PROBE, Extension
 from sipe_bayes.structure.machine import Machine
+
+
+class TendonViscousFriction(Extension):
+    """Friction along a tendon that is proportional to its velocity."""
+
+    name, kind = "tendon_viscous_friction", "tendon"
+    reference = "MuJoCo documentation, tendon damping"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"viscous friction along {site}"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Damping up to what would take the whole force at the usual speed."""
+        sizes = machine.tendons[site]
+        target = f"tendon:{site}.damping"
+        return (
+            Parameter(
+                f"{site}.viscous_friction",
+                0.0,
+                2 * sizes.force / sizes.velocity,
+                targets=(target,),
+                description="force per velocity",
+            ),
+        )
+
+
+class TendonDryFriction(Extension):
+    """Dry friction along a tendon, as of a cable in its sheath or over its pulleys."""
+
+    name, kind = "tendon_dry_friction", "tendon"
+    reference = "MuJoCo documentation, tendon frictionloss"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"dry friction along {site}"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Up to the usual force."""
+        sizes = machine.tendons[site]
+        target = f"tendon:{site}.frictionloss"
+        return (
+            Parameter(f"{site}.dry_friction", 0.0, sizes.force, targets=(target,), description="level of dry friction"),
+        )
 
 
 class TendonSpring(Extension):

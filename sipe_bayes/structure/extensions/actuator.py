@@ -1,0 +1,484 @@
+"""Extensions at actuators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.envs.internal.states import UNSETTLED, declare_start
+from sipe_bayes.structure.extension import PROBE, Extension, members
+from sipe_bayes.structure.machine import Machine
+
+_LONGEST, _SAMPLES = 0.2, 50  # seconds, or so many samples
+_LEAST = 0.1  # of the largest command
+_SIZES = 0.9, 0.7, 0.5  # of it: a limit that is never met has no effect
+_MOST_POWER, _FORCES = 2.5, 5.0
+_MOST_COGGING = 60  # periods in a turn
+_SD, _FURTHEST = 0.1, 0.5  # of the model's gain
+
+
+class Delay(Extension):
+    """A command that takes effect late."""
+
+    name, kind = "delay", "actuator"
+    reference = "MuJoCo documentation, actuator delay"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"a delay of {site}"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Up to a tenth of a second, or twenty samples."""
+        return (
+            Parameter(
+                f"{site}.delay",
+                0.0,
+                min(0.1, 20 * machine.dt),
+                targets=tuple(f"actuator:{name}.delay" for name in members(site)),
+                description="from command to force",
+            ),
+        )
+
+    def groups(self, machine: Machine) -> tuple[tuple[str, ...], ...]:
+        """Actuators of one make."""
+        return machine.alike
+
+    def imitators(self, site: str) -> tuple[str, ...]:
+        """A first-order lag."""
+        return tuple(f"actuator:{name}.lag" for name in members(site))
+
+    def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
+        """One sample, and at least two physics steps."""
+        (delay,) = parameters
+        return np.array([[max(machine.dt, 2 * machine.timestep) / delay.high]])
+
+
+@dataclass(frozen=True)
+class FilteredCommand:
+    """Actuators that follow their commands through a first-order lag, exactly integrated, none by default.
+
+    Args:
+        actuators: their names.
+        unsettled: how far a window may start from the command before it.
+    """
+
+    actuators: tuple[str, ...]
+    unsettled: float
+
+    def __call__(self, spec: mujoco.MjSpec) -> None:
+        """Give them the filter; raises ValueError for one that has dynamics of its own."""
+        for name in self.actuators:
+            actuator = spec.actuator(name)
+            if int(actuator.dyntype) != int(mujoco.mjtDyn.mjDYN_NONE):
+                raise ValueError(f"actuator {name!r}: has dynamics of its own; add its lag as a parameter")
+            actuator.dyntype, actuator.actearly = mujoco.mjtDyn.mjDYN_FILTEREXACT, True
+            actuator.dynprm = np.zeros(len(actuator.dynprm))
+            declare_start(spec, f"actuator:{name}", [self.unsettled])
+
+
+class Lag(Extension):
+    """A command that takes effect little by little: a first-order lag."""
+
+    name, kind = "lag", "actuator"
+    reference = 'MuJoCo documentation, actuator dyntype="filterexact"'
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"a first-order lag of {site}"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Up to a fifth of a second, or fifty samples."""
+        return (
+            Parameter(
+                f"{site}.lag",
+                0.0,
+                min(_LONGEST, _SAMPLES * machine.dt),
+                targets=tuple(f"actuator:{name}.lag" for name in members(site)),
+                description="time constant from command to force",
+            ),
+        )
+
+    def edit(self, machine: Machine, site: str) -> FilteredCommand:
+        """The filter."""
+        names = members(site)
+        return FilteredCommand(names, UNSETTLED * (max(machine.commands[name] for name in names) or 1.0))
+
+    def groups(self, machine: Machine) -> tuple[tuple[str, ...], ...]:
+        """Actuators of one make."""
+        return machine.alike
+
+    def imitators(self, site: str) -> tuple[str, ...]:
+        """A delay."""
+        return tuple(f"actuator:{name}.delay" for name in members(site))
+
+    def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
+        """One sample, and at least two physics steps."""
+        (lag,) = parameters
+        return np.array([[max(machine.dt, 2 * machine.timestep) / lag.high]])
+
+
+class Offset(Extension):
+    """A zero error of the command."""
+
+    name, kind = "offset", "actuator"
+    reference = "-"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"an offset of {site}"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Up to the largest command, either way."""
+        size = machine.commands[site] or 1.0
+        return (
+            Parameter(
+                f"{site}.offset",
+                -size,
+                size,
+                targets=(f"actuator:{site}.offset",),
+                description="added to the command",
+            ),
+        )
+
+
+class BackEmf(Extension):
+    """A force that falls with the velocity, as under voltage control."""
+
+    name, kind = "back_emf", "actuator"
+    reference = "MuJoCo documentation, actuator/dcmotor"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"back-EMF of {site}"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Up to the usual force at the usual speed."""
+        joint = machine.joint_of(site)
+        if joint is None or machine.is_position(site):
+            return ()
+        most = 2 * machine.forces[site] / machine.joints[joint].velocity
+        return (
+            Parameter(
+                f"{site}.back_emf",
+                -most,
+                0.0,
+                targets=(f"actuator:{site}.bias_velocity",),
+                description="force per velocity",
+            ),
+        )
+
+
+class ForceLimit(Extension):
+    """A force that goes no further."""
+
+    name, kind = "force_limit", "actuator"
+    reference = "MuJoCo documentation, actuator forcerange"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"a limit of the force of {site}"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """From a third of the usual force to five times of it."""
+        usual = machine.forces[site]
+        return (
+            Parameter(
+                f"{site}.force_limit",
+                usual / 3,
+                5 * usual,
+                targets=(f"actuator:{site}.force_limit",),
+                description="largest force either way",
+            ),
+        )
+
+    def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
+        """At the usual force and a third above: a limit that is never met has no effect."""
+        return np.array([[[0.143]], [[0.214]], [[0.3]]])
+
+
+class CommandLimit(Extension):
+    """A command that goes no further: a set-point that is limited, or a duty.
+
+    Of an actuator whose force depends on the motion too; elsewhere it is a limit of the force.
+    """
+
+    name, kind = "command_limit", "actuator"
+    reference = "MuJoCo documentation, actuator ctrlrange"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"a limit of the command of {site}"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """From a tenth of the largest command to all of it."""
+        largest = machine.commands[site]
+        if not largest or not machine.is_position(site):
+            return ()
+        return (
+            Parameter(
+                f"{site}.command_limit",
+                _LEAST * largest,
+                largest,
+                targets=(f"actuator:{site}.command_limit",),
+                description="largest command either way",
+            ),
+        )
+
+    def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
+        """At three shares of the largest command."""
+        (limit,) = parameters
+        return np.array([[[float(limit.normalise(share * limit.high))]] for share in _SIZES])
+
+
+class ForceDrop(Extension):
+    """A force that falls short the more of it is asked for."""
+
+    name, kind = "force_drop", "actuator"
+    reference = "-"
+    native = False
+    nearest = "actuator gain, at its mean over the motion"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"a gain of {site} that changes with its force"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Up to a half at twice the usual force."""
+        names = members(site)
+        most = 0.25 / max(machine.forces[name] for name in names)
+        return (
+            Parameter(
+                f"{site}.force_drop",
+                -most,
+                most,
+                targets=tuple(f"actuator:{name}.force_drop" for name in names),
+                description="relative loss per force",
+            ),
+        )
+
+    def groups(self, machine: Machine) -> tuple[tuple[str, ...], ...]:
+        """Actuators of one make."""
+        return machine.alike
+
+
+class DirectionGain(Extension):
+    """A force that is larger one way than the other, as a propeller's or a cylinder's."""
+
+    name, kind = "direction_gain", "actuator"
+    reference = "T. I. Fossen 2011, Handbook of Marine Craft Hydrodynamics and Motion Control"
+    native = False
+    nearest = "actuator gain, at its mean over the motion"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"a gain of {site} that differs by direction"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Up to a half either way."""
+        return (
+            Parameter(
+                f"{site}.direction_gain",
+                -0.5,
+                0.5,
+                targets=tuple(f"actuator:{name}.direction_gain" for name in members(site)),
+                description="share of the force, more forward and less backward",
+            ),
+        )
+
+    def groups(self, machine: Machine) -> tuple[tuple[str, ...], ...]:
+        """Actuators of one make."""
+        return machine.alike
+
+
+class Power(Extension):
+    """A force that goes with a power of its command, as a propeller's with the square of its speed."""
+
+    name, kind = "power", "actuator"
+    reference = "T. I. Fossen 2011, Handbook of Marine Craft Hydrodynamics and Motion Control"
+    native = False
+    nearest = "actuator gain, at its mean over the motion"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"a force of {site} that goes with a power of its command"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """From a root to more than the square; a fifth to five times of the usual force is the model's."""
+        names = members(site)
+        usual = max(machine.forces[name] for name in names)
+        return (
+            Parameter(
+                f"{site}.exponent",
+                1 / _MOST_POWER,
+                _MOST_POWER,
+                scale="log",
+                targets=tuple(f"actuator:{name}.exponent" for name in names),
+                description="power of the command that the force goes with",
+            ),
+            Parameter(
+                f"{site}.exponent_force",
+                usual / _FORCES,
+                usual * _FORCES,
+                scale="log",
+                targets=tuple(f"actuator:{name}.exponent_force" for name in names),
+                description="force that is the model's whatever the power",
+            ),
+        )
+
+    def groups(self, machine: Machine) -> tuple[tuple[str, ...], ...]:
+        """Actuators of one make."""
+        return machine.alike
+
+    def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
+        """A power a little above one, about the usual force."""
+        return np.array([[0.5 + PROBE, 0.5]])
+
+
+class DeadZone(Extension):
+    """A force of which the first bit moves nothing, as an amplifier's or a valve's."""
+
+    name, kind = "dead_zone", "actuator"
+    reference = "G. Tao and P. V. Kokotovic 1996, Adaptive Control of Systems with Actuator and Sensor Nonlinearities"
+    native = False
+    nearest = "dry friction, where the actuator drives a joint"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"a dead zone of {site}"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Up to the usual force."""
+        names = members(site)
+        return (
+            Parameter(
+                f"{site}.dead_zone",
+                0.0,
+                max(machine.forces[name] for name in names),
+                targets=tuple(f"actuator:{name}.dead_zone" for name in names),
+                description="force of which nothing arrives",
+            ),
+        )
+
+    def groups(self, machine: Machine) -> tuple[tuple[str, ...], ...]:
+        """Actuators of one make."""
+        return machine.alike
+
+
+class Cogging(Extension):
+    """A torque that goes round with the rotor."""
+
+    name, kind = "cogging", "actuator"
+    reference = "MuJoCo documentation, actuator/dcmotor, cogging"
+    native = False
+    nearest = "actuator/dcmotor, cogging"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"cogging at the joint of {site}"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """Up to a third of the usual force, with 1 to 60 poles."""
+        joint = machine.joint_of(site)
+        if joint is None or not machine.is_hinge(joint):
+            return ()
+        most, at = machine.joints[joint].force / 3, f"joint:{joint}"
+        return (
+            Parameter(f"{site}.cogging_sin", -most, most, targets=(f"{at}.cogging_sin",), description="sine part"),
+            Parameter(f"{site}.cogging_cos", -most, most, targets=(f"{at}.cogging_cos",), description="cosine part"),
+            Parameter(
+                f"{site}.cogging_poles",
+                1.0,
+                float(_MOST_COGGING),
+                scale="log",
+                targets=(f"{at}.cogging_poles",),
+                description="periods in a turn",
+            ),
+        )
+
+    def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
+        """A little of either phase, for numbers of poles that the motion's range tells apart."""
+        range_of = 2 * machine.joints[parameters[0].targets[0].removeprefix("joint:").rpartition(".")[0]].position
+        apart = max(np.pi / max(range_of, 0.1) / 1.5, 1.0)  # whole periods, or as far as the range tells apart
+        poles = np.log(np.arange(1.0, _MOST_COGGING, apart)) / np.log(_MOST_COGGING)
+        phases = ((PROBE, 0.0), (0.0, PROBE))
+        return np.array([[[0.5 + a, 0.5 + b, n] for a, b in phases] for n in poles])
+
+
+class Gain(Extension):
+    """A gain that is another one than the model's: of a motor's constant data sheets know about a tenth."""
+
+    name, kind = "gain", "actuator"
+    reference = "-"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"a gain of {site} that is not the model's"
+
+    def wholes(self, machine: Machine, site: str) -> tuple[float, ...]:
+        """All of it."""
+        return (float(machine.model.actuator(site).gainprm[0]),)
+
+    def off(self, site: str, share: float) -> str:
+        """See ``Extension``."""
+        return f"a gain of {site} that is {100 * share:.3g} % off"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """The gain, with a normal prior of a tenth around the model's.
+
+        None where gear or gain are unknown, nor of drives whose force is no one number's multiple: velocity servos,
+        motors with a bias, muscles and dcmotors.
+        """
+        index = machine.model.actuator(site).id
+        gain, bias = float(machine.model.actuator_gainprm[index, 0]), machine.model.actuator_biasprm[index]
+        scaled = {f"actuator:{site}.{number}" for number in ("gear", "gain", "kp")}
+        servo = bias[1] == -gain and not bias[0]
+        if not gain or scaled & machine.written() or not (servo or not bias[:3].any()):
+            return ()
+        low, high = sorted((gain * (1 - _FURTHEST), gain * (1 + _FURTHEST)))
+        return (
+            Parameter(
+                f"{site}.gain",
+                low,
+                high,
+                prior_mean=gain,
+                prior_sd=_SD * abs(gain),
+                targets=(f"actuator:{site}.{'kp' if servo else 'gain'}",),
+                description="force for each unit of command",
+            ),
+        )
+
+
+class LogGain(Extension):
+    """A gain that is another one in each log, as a battery's charge or a motor's temperature make it."""
+
+    name, kind = "log_gain", "actuator"
+    reference = "-"
+
+    def sentence(self, site: str) -> str:
+        """What it is."""
+        return f"a gain of {site} that differs between the logs"
+
+    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
+        """A gain for each log, with a normal prior of a tenth around the model's."""
+        gain = float(machine.model.actuator_gainprm[machine.model.actuator(site).id, 0])
+        if len(machine.logs) < 2 or not gain:
+            return ()
+        target = f"actuator:{site}.{'kp' if machine.is_position(site) else 'gain'}"
+        low, high = sorted((gain * (1 - _FURTHEST), gain * (1 + _FURTHEST)))
+        return tuple(
+            Parameter(
+                f"{site}.gain[{log}]",
+                low,
+                high,
+                prior_mean=gain,
+                prior_sd=_SD * abs(gain),
+                targets=(target,),
+                log=log,
+                description="gain in this log",
+            )
+            for log in machine.logs
+        )

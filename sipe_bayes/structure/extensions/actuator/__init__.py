@@ -1,1 +1,0 @@
-"""Extensions at actuators."""

@@ -1,1 +1,0 @@
-"""Extensions at a body: its numbers that the model has wrong."""

@@ -1,1 +1,0 @@
-"""Extensions of gears, links and bases that give way."""

@@ -1,1 +1,0 @@
-"""Extensions of sensors, of the world and of what no piece of physics explains."""
