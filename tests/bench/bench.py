@@ -30,7 +30,6 @@ import everyday
 import executors
 import fits
 import laws
-import mdn
 import mujoco
 import mujoco.rollout
 import numpy as np
@@ -246,7 +245,7 @@ def chain() -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     tables = (
-        *("engine", "batch", "rival", "stages", "chain", "envs", "memory", "mdn", "fits", "ddpg", "laws", "executors"),
+        *("engine", "batch", "rival", "stages", "chain", "envs", "memory", "fits", "ddpg", "laws", "executors"),
         *("discover", "transfer", "shapes", "everyday"),
     )
     parser.add_argument("tables", nargs="*", help=f"any of {', '.join(tables)}; default all")
@@ -265,8 +264,6 @@ def main() -> None:
             chain()
         elif name == "memory":
             envs.memory()
-        elif name == "mdn":
-            mdn.table(given.pairs)
         elif name == "fits":
             fits.table()
         elif name == "ddpg":

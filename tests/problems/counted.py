@@ -15,15 +15,16 @@ TRUTH = [0.6, 0.05]
 
 
 class Counting(Simulator):
-    """Counts the lanes that are really simulated."""
+    """Counts the lanes and the control steps that are really simulated."""
 
     def __init__(self) -> None:
         super().__init__(pendulum().environment, num_threads=1)
-        self.lanes = 0
+        self.lanes = self.steps = 0
 
     def rollout(self, theta: Any, *args: Any, **settings: Any) -> Trajectories:
         made = super().rollout(theta, *args, **settings)
         self.lanes += len(made)
+        self.steps += len(made) * (made.observations.shape[1] - 1)
         return made
 
 

@@ -8,8 +8,10 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
 **Phases**, one step of each is a linearisation and the best of a few damped steps (Levenberg, Marquardt):
 
 1. PLAIN: theta alone, the segments begin as measured, white noise of the residuals' present size. On a part of the
-   segments first, then on as many as ``linearised_steps`` allows. Its end is the plain fit, the first answer. Of steps
-   that gain about the same the shortest is taken: what a log leaves open stays near the model as given.
+   segments first, a quarter of what follows, of a single segment its beginning; then on as many as
+   ``linearised_steps`` allows. A quarter of short logs that leaves a direction open (sd above a tenth of the cube) is
+   left after a step. The end is the plain fit, the first answer. Of steps that gain about the same the shortest is
+   taken: what a log leaves open stays near the model as given.
 2. FIT: theta and the initial states, noise by restricted likelihood before each step; on the same part, then on
    ``whole`` times as many segments. Columns of the initial states are kept while they predict what a step gains. Where
    one after the tenth step gains less than three quarters of what it promised, further ones by the same linearisation
@@ -29,8 +31,9 @@ are those of the posterior's width, whatever dry friction or a delay does below 
 **Other optima** that fit as well are looked for after the fit, unless ``restarts`` is one: two distances of a centre of
 mass from its joint give a pendulum one period. Plain fits go down from four points far from the optimum, and from the
 best draws of the prior where residuals are larger than ``poor`` times the samples' scatter; first on half seconds of
-few segments, mostly a twentieth of the cost so far, then on the smallest part. If one ends elsewhere, fits as well, and
-what lies between fits worse, FIT follows it. From known states FIT also follows an end that fits clearly better than a
+few segments, mostly a twentieth of the cost so far, then on the smallest part. One that leads back to an optimum in
+every direction is given up. If one ends elsewhere, fits as well, and what lies between fits worse, FIT follows it. From
+known states FIT also follows an end that fits clearly better than a
 poor optimum. All optima are kept, weighted by their evidence. Where simulations from measured initial states miss the
 log by far more than the noise, plain fits tell nothing: a poor fit is followed by one from the best draw, no other.
 
@@ -312,8 +315,9 @@ class SegmentSolver:
             if share < 1:
                 keep = spread_segments(windows.log, share)
                 windows = windows.part(keep)
-                if part == len(self._beginnings) and (longer := share * self.windows.num_windows / len(keep)) < 1:
-                    windows = windows.beginnings(self._least_steps(windows, int(longer * windows.steps.max())))
+                if part == len(self._beginnings) and len(keep) == len(np.unique(self.windows.log)) > 0:
+                    steps = share * self.windows.num_windows / len(keep) * windows.steps.max()
+                    windows = windows.beginnings(self._least_steps(windows, int(steps)))
             if part < len(self._beginnings):
                 windows = windows.beginnings(self._beginnings[part])
             self._views[part] = keep, windows
@@ -424,9 +428,11 @@ class SegmentSolver:
             return replace(state, here=replace(here, stage=Stage.FIT, residual=None, starts_jacobian=None))
         after, more = step.after, self._next_part(Stage.PLAIN, here.part, here.enough > 0)
         enough = self._plain_enough(view, here, step.lin.residual)
-        if here.part == 0 and more:
-            open_directions = np.linalg.eigvalsh(step.hessian)[0] < 1 / 0.1**2  # a part would lead astray along them
+        if here.part == 0 and more and self._share(len(self._beginnings) + 1) >= 1:  # a quarter of little
+            open_directions = np.linalg.eigvalsh(step.hessian)[0] < 1 / 0.1**2  # it would lead astray along them
             enough = np.inf if open_directions else max(0.2 * view.observed.sum(), enough)
+        elif here.part == 0 and more:
+            enough *= 10.0
         if not step.ends(enough, foretold=not here.enough) and after.iteration < self.tuning.most_steps:
             return replace(state, here=after)
         if here.part == 0 and self._beginnings and len(state.ends) < len(state.points):

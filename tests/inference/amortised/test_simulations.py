@@ -78,11 +78,11 @@ def test_no_more_is_simulated_than_the_budget_says(name: str, every: int) -> Non
     logs = [log(simulator, TRUTH, k, steps=60) for k in (1, 2)]
     settings = {"budget": 150, **FORM.get(name, {}), **({"rounds": 2} if "rounds" in arguments(name) else {})}
     estimator = get_estimator(simulator, name, **{**settings, "budget": min(150, settings["budget"])})
-    simulator.lanes = 0
+    simulator.steps = 0
     windows = 1 if isinstance(estimator, PriorSampling) else -(-60 // 50)  # of half a second, a lane each
     for k in range(30):
         estimator.update_parameter_estimate(logs[k // every % 2])
-    assert 0 < simulator.lanes <= estimator.budget * windows
+    assert 0 < simulator.steps <= estimator.budget * windows * 60
     assert estimator.rollouts <= estimator.budget
 
 
