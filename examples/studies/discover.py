@@ -11,11 +11,11 @@ one joint, in three sizes: what its force (or what it does to the command) is of
 %; delays and lags of 1, 2 and 4 samples, powers of 1.1, 1.2 and 1.4. A slide has no cogging. The null is the right
 model.
 
-A cause is named where the structures that hold it have together a probability of at least 5 %, as in the report:
+A cause is named where a structure of the reported set holds it:
 several that explain a log about as well are all named (a slide's motor with a zero error moves as one on a tilted
-rail); at the right joint where they hold it there. ``first`` asks for it in the most probable structure. Coverage is
-that of 90 % intervals of the masses, without the search and averaged over its structures. Every search is one line in
-runs/, so an interrupted study goes on; results/discover.json holds the tables, results/discover.png what was named
+rail); at the right joint where they hold it there. ``first`` asks for it in the structure that is written out.
+Coverage is that of 90 % intervals of the masses, without the search and stacked over the set. Every search is one line
+in runs/, so an interrupted study goes on; results/discover.json holds the tables, results/discover.png what was named
 where.
 """
 

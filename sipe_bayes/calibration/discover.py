@@ -48,7 +48,7 @@ def discover(
         progress: called along the way.
 
     Returns:
-        The structures that were fitted: ``.table()``, ``.best``, ``.posterior`` (averaged over them).
+        The structures that were fitted: ``.table()``, ``.best``, ``.posterior`` (stacked over the set).
 
     Raises:
         ValueError: for input that cannot be used; the message is one line with the remedy.

@@ -38,7 +38,7 @@ from sipe_bayes.likelihood import BoundLikelihood, QuadraticPrior
 from sipe_bayes.posterior import Particles
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.structure.columns import corrected
-from sipe_bayes.structure.comparison import difference
+from sipe_bayes.structure.comparison import difference, rank
 from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.state import Phase
@@ -74,7 +74,7 @@ def summarise(
         before = _Model(problem, structures, structures.plain, tell, structures.search.extensions)
     logs = ({} if problem.holdout is None else {"holdout": problem.holdout}) | {"train": problem.train}
     compared = [row for use, own in logs.items() for row in _errors(use, before, after, own)]
-    averaged = Marginals.of(structures.posterior, problem.prior, seed)
+    stacked = Marginals.of(structures.posterior, problem.prior, seed)
     plain, left = before.stage(seed), after.stage(seed)
     further = after.further(seed) if left.misfit is None or left.misfit.matters else None
     unknown = [label for label in structures.best.labels if structures.search.placed[label].parameters]
@@ -87,7 +87,7 @@ def summarise(
         promises=_promises(structures),
         posterior=structures.posterior,
         prior=problem.prior,
-        parameters=tuple(averaged.summaries(_part(further, problem.prior.space))),
+        parameters=tuple(stacked.summaries(_part(further, problem.prior.space))),
         plain_parameters=tuple(before.summaries(seed)),
         added=tuple(added),
         best=after.values,
@@ -125,7 +125,7 @@ def _untried(structures: Structures) -> str:
     """Pieces that a search whose budget was spent did not try, or not to the end, in words."""
     state, search = structures.state, structures.search
     if state.cut is Phase.FIT:
-        names = [search.placed[labels[-1]].sentence for labels in state.queue]
+        names = list(dict.fromkeys(search.placed[labels[-1]].sentence for labels in state.queue))
     elif state.cut in (Phase.COLUMNS, Phase.RANK):
         there = structures.best.labels
         names = [p.sentence for p in search.placed.values() if p.parameters and p.label not in there]
@@ -275,13 +275,13 @@ def _pieces(structures: Structures) -> tuple[Piece, ...]:
 def _gain(structures: Structures, label: str) -> tuple[float, float] | tuple[None, None]:
     """What an extension adds to the rest of the best structure that has it, and the standard error of that."""
     having = [one for one in structures.fitted if label in one.labels]
-    one = max(having, key=lambda one: difference(one, structures.plain).nats)
+    one = max(having, key=rank)
     rest = structures.state.of([other for other in one.labels if other != label])
     return (None, None) if rest is None else difference(one, rest)
 
 
 def _added(structures: Structures, label: str, further: Particles | None, seed: int) -> list[ParameterSummary]:
-    """Parameters of an extension of the best structure, averaged over the structures that have it.
+    """Parameters of an extension of the best structure, stacked over the structures that have it.
 
     further: of all parameters of the best one.
     """

@@ -337,7 +337,7 @@ class Code(Enum):
     )
     STRUCTURE_UNCERTAIN = caution(
         "Other structures predict these logs as well: the one of this model has a stacking weight of {weight:.2g}. "
-        "Intervals hold if its structure is right. The report of `sipe discover` has intervals of all of them"
+        "Intervals hold if its structure is right. The report of `sipe discover` has intervals stacked over all of them"
     )
     COMMAND_DOUBTED = caution(
         "column {column!r} {reason}, and is given as the command of {actuator!r}, which takes {drive}"

@@ -246,6 +246,7 @@ class Estimator(ABC, Generic[S]):
             stored.write()
             self.find(Code.BUDGET_SPENT, budget=self.budget)
         except BaseException:  # whatever interrupts it; an earlier checkpoint outlives a failure in the first step
+            self._set_deadline(math.inf)
             if self.checkpoint is not None and (last is not first or not self.checkpoint.exists()):
                 with suppress(OSError):
                     stored.write()

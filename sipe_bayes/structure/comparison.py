@@ -20,7 +20,7 @@ log of the weighted mixture (Y. Yao, A. Vehtari, D. Simpson, A. Gelman 2018, htt
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +30,7 @@ from sipe_bayes.structure.fitted import FittedStructure
 
 _ERRORS = 2.0  # standard errors within which structures are ties
 _ALIKE = 0.5  # largest correlation of neighbours: motions that tell more follow each other, too
+_LEAST = 0.01  # weight of a tie
 _ROUNDS = 200  # of the weights' iteration, which never lowers what it maximises
 
 
@@ -45,44 +46,48 @@ class Difference(NamedTuple):
         return self.nats > _ERRORS * self.error
 
 
+def rank(one: FittedStructure) -> tuple[int, float]:
+    """How well a structure predicts, to sort by: pieces on which it diverges count first, then nats."""
+    density = one.held.density
+    lost = int(np.isneginf(density).sum())
+    return -lost, float(density[np.isfinite(density)].sum())
+
+
 def difference(one: FittedStructure, other: FittedStructure) -> Difference:
-    """How much better a structure predicts than another; by their evidence where the logs have no pieces."""
-    if not len(one.held.density):
-        gain = one.evidence - other.evidence
-        return Difference(gain, float(np.sqrt(2 * abs(gain))))
-    if not np.isfinite(one.held.density).all() or not np.isfinite(other.held.density).all():
-        worse, better = (bool(np.isneginf(each.held.density).any()) for each in (one, other))
-        return Difference(0.0 if worse == better else -np.inf if worse else np.inf, 0.0)
-    each = one.held.density - other.held.density
+    """How much better a structure predicts than another; infinite where one of them diverges on more pieces."""
+    if (kept := rank(one)[0] - rank(other)[0]) != 0:
+        return Difference(kept * np.inf, 0.0)
+    both = np.isfinite(one.held.density) & np.isfinite(other.held.density)
+    each, log = (one.held.density - other.held.density)[both], one.held.log[both]
     total = float(each.sum())
-    opposing, follows = each[each * total < 0], one.held.log[1:] == one.held.log[:-1]
-    apart = each - each.mean()
+    opposing, follows = each[each * total < 0], log[1:] == log[:-1]
+    apart = each - each.mean() if len(each) else each
     alike = float(apart[1:][follows] @ apart[:-1][follows]) / max(float(apart @ apart), 1e-300)
     alike = min(max(alike, 0.0), _ALIKE)
-    square = 2 * float(_mean_squares(one if total > 0 else other) @ np.abs(each)) + 2 * float(opposing @ opposing)
+    whitened = np.maximum((one if total > 0 else other).held.square[both], 1.0)
+    square = 2 * float(whitened @ np.abs(each)) + 2 * float(opposing @ opposing)
     return Difference(total, float(np.sqrt(square * (1 + alike) / (1 - alike))))
 
 
-def _mean_squares(one: FittedStructure) -> FloatArray:
-    """Of a structure's whitened residuals in each piece (K,), at least one; over all pieces it is one."""
-    density, samples = one.held.density, one.held.samples
-    return np.maximum(1 + 2 * (density.sum() / samples.sum() - density / samples), 1.0)
+def choose_ties(
+    structures: Sequence[FittedStructure], contains: Callable[[FittedStructure, FittedStructure], bool]
+) -> list[FittedStructure]:
+    """The structures within two standard errors of the best one, without those of which a part is a tie as well.
 
-
-def choose_ties(structures: Sequence[FittedStructure]) -> list[FittedStructure]:
-    """The structures within two standard errors of the best one, without those of which a part is a tie as well."""
-    best = max(structures, key=lambda one: difference(one, structures[0]).nats)
+    contains: whether the first one contains the second one, and more.
+    """
+    best = max(structures, key=rank)
     ties = [one for one in structures if one is best or not difference(best, one).clear]
-    return [one for one in ties if not any(set(other.labels) < set(one.labels) for other in ties)]
+    return [one for one in ties if not any(contains(one, other) for other in ties)]
 
 
 def stack(structures: Sequence[FittedStructure]) -> FloatArray:
-    """Stacking weights (S,) of structures."""
+    """Stacking weights (S,) of structures, each at least a hundredth: ties may all be right."""
     weight = np.full(len(structures), 1 / len(structures))
-    if not len(structures[0].held.density):
-        return weight
     densities = np.stack([one.held.density for one in structures], axis=1)
-    densities = np.exp(densities - densities.max(1, keepdims=True))
-    for _ in range(_ROUNDS):
+    densities = densities[np.isfinite(densities).all(1)]
+    densities = np.exp(densities - densities.max(1, keepdims=True, initial=-np.inf))
+    for _ in range(_ROUNDS if len(densities) else 0):
         weight = weight * (densities / (densities @ weight)[:, None]).mean(0)
+    weight = np.maximum(weight / weight.sum(), _LEAST)
     return weight / weight.sum()

@@ -1,4 +1,4 @@
-"""From logs to a distribution over structures, with budget, checkpoint, resume and progress as every fit has them."""
+"""From logs to the set of structures that they support, with budget, checkpoint, resume and progress."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def discover(
     Args:
         simulator: of an ``MjcfEnvironment``, the user's model with its unknowns.
         trajectories: the logs.
-        holdout: logs that no structure is fitted to; one that they speak against is not kept.
+        holdout: logs that no structure is fitted to; they count as held-out pieces do.
         prior: of the unknowns; default their own.
         likelihood: how logs are cut into windows; the noise is coloured whatever it says.
         restriction: which extensions may be tried, and where.

@@ -37,23 +37,29 @@ _PIECES = 40  # of all logs together, at most
 
 @dataclass(frozen=True)
 class Pieces:
-    """Log predictive densities (K,) in nats of pieces, which log each is of (K,), and how many samples it has (K,)."""
+    """What was held out, piece by piece.
+
+    Args:
+        density: (K,), log predictive density in nats; minus infinity where the simulation diverges.
+        log: (K,), which log each piece is of.
+        square: (K,), mean square of the whitened residuals, by the density.
+    """
 
     density: FloatArray
     log: IntArray
-    samples: IntArray
+    square: FloatArray
 
     def beside(self, other: Pieces) -> Pieces:
         """These, and pieces of other logs, which are counted on."""
         log = np.concatenate([self.log, other.log + self.log.max(initial=-1) + 1])
-        both = zip((self.density, self.samples), (other.density, other.samples), strict=True)
-        density, samples = (np.concatenate(pair) for pair in both)
-        return Pieces(density, log, samples)
+        both = zip((self.density, self.square), (other.density, other.square), strict=True)
+        density, square = (np.concatenate(pair) for pair in both)
+        return Pieces(density, log, square)
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Of one structure: its evidence log p(y) in nats, and its pieces; none where the logs are one window."""
+    """Of one structure: its evidence log p(y) in nats, and its pieces; without pieces the evidence is one."""
 
     evidence: float
     pieces: Pieces
@@ -85,13 +91,14 @@ def scores(
     evidence = _Linear(windows, theta, starts, prior).evidence(products, float(constants.sum()))
     parts = _parts(windows)
     if len(parts) < 2 or len(products) < len(windows.log):
-        return Scores(evidence, _pieces(windows, [], np.zeros(0)))
+        whole = [np.ones(windows.num_windows, bool)]
+        return Scores(evidence, _pieces(windows, whole, np.array([evidence]), constants))
     windows = windows.cut(np.array([part.argmax() for part in parts]))
     products, constants = windows.moments(linearisation).normal(noise), _log_determinants(windows, noise)
     linear = _Linear(windows, theta, starts, prior)
     whole = linear.evidence(products, float(constants.sum()))
     without = [linear.evidence_of(products, constants, ~part) for part in parts]
-    return Scores(evidence, _pieces(windows, parts, whole - np.array(without)))
+    return Scores(evidence, _pieces(windows, parts, whole - np.array(without), constants))
 
 
 def predictive(windows: BoundLikelihood, theta: FloatArray, noise: Noise, posterior: QuadraticPrior) -> Pieces:
@@ -107,25 +114,25 @@ def predictive(windows: BoundLikelihood, theta: FloatArray, noise: Noise, poster
         posterior: of theta, given the training logs.
     """
     own, windows = windows, windows.compared_late()
-    parts, starts = _parts(windows), windows.no_starts()
+    parts = _parts(windows) if windows.num_start else [np.ones(windows.num_windows, bool)]  # known starts: one block
+    starts = windows.no_starts()
     begun = windows.linearise(theta, starts, with_theta=False)
     if begun.valid:
         starts = starts + windows.log_density(windows.moments(begun), noise, starts)[1]
     linearisation = windows.linearise(theta, starts)
     own.rollouts += windows.rollouts if windows is not own else 0
-    moments = windows.moments(linearisation)
-    if len(moments.normal(noise)) < len(windows.log):
-        parts = [np.ones(windows.num_windows, bool)]
     if not linearisation.valid:
-        return _pieces(windows, parts, np.full(len(parts), -np.inf))
+        lost = np.full(len(parts), -np.inf)
+        return Pieces(lost, np.array([windows.log[part][0] for part in parts]), np.ones(len(parts)))
     pulls = windows.pulls(posterior.precision, posterior.pull(theta), starts)
-    noise = windows.estimate_noise(moments, noise, pulls, True)
+    noise = windows.estimate_noise(windows.moments(linearisation), noise, pulls, True)
     windows = windows.cut(np.array([part.argmax() for part in parts]))
-    moments = windows.moments(linearisation)
-    products, constants = moments.normal(noise), _log_determinants(windows, noise)
+    products, constants = windows.moments(linearisation).normal(noise), _log_determinants(windows, noise)
     linear = _Linear(windows, theta, starts, posterior)
-    density = [linear.evidence_of(products, constants, part) for part in parts]
-    return _pieces(windows, parts, np.array(density))
+    if not windows.num_start:
+        return _pieces(windows, parts, np.array([linear.evidence(products, float(constants.sum()))]), constants)
+    density = np.array([linear.evidence_of(products, constants, part) for part in parts])
+    return _pieces(windows, parts, density, constants)
 
 
 @dataclass(frozen=True)
@@ -179,14 +186,20 @@ def _log_determinants(windows: BoundLikelihood, noise: Noise) -> FloatArray:
 
 
 def _parts(windows: BoundLikelihood) -> list[BoolArray]:
-    """Which windows (W,) each piece has: adjacent ones of one log."""
-    numbers, logs = np.arange(windows.num_windows), np.unique(windows.log)
-    most = max(_PIECES // len(logs), 1)
-    split = [np.array_split(own, min(most, len(own))) for own in (numbers[windows.log == k] for k in logs)]
-    return [np.isin(numbers, part) for parts in split for part in parts]
+    """Which windows (W,) each piece has: adjacent ones of one log, those without samples left out."""
+    numbers = np.flatnonzero(windows.observed.any((1, 2)))
+    log = windows.log[numbers]
+    most = max(_PIECES // max(len(np.unique(log)), 1), 1)
+    split = [np.array_split(own, min(most, len(own))) for own in (numbers[log == k] for k in np.unique(log))]
+    return [np.isin(np.arange(windows.num_windows), part) for parts in split for part in parts]
 
 
-def _pieces(windows: BoundLikelihood, parts: list[BoolArray], density: FloatArray) -> Pieces:
-    log, samples = windows.log, windows.observed.sum((1, 2))
-    of_log, size = [log[part][0] for part in parts], [samples[part].sum() for part in parts]
-    return Pieces(density, np.array(of_log, np.int64), np.array(size, np.int64))
+def _pieces(windows: BoundLikelihood, parts: list[BoolArray], density: FloatArray, constants: FloatArray) -> Pieces:
+    """Pieces of densities (K,) whose windows have rows' log|2 pi V| (W,)."""
+    samples = windows.observed.sum((1, 2))
+    count = np.array([max(samples[part].sum(), 1) for part in parts])
+    square = (-2 * density - np.array([constants[part].sum() for part in parts])) / count
+    return Pieces(density, np.array([windows.log[part][0] for part in parts], np.int64), square)
+
+
+NO_PIECES = Pieces(np.zeros(0), np.zeros(0, np.int64), np.zeros(0))

@@ -35,7 +35,7 @@ from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood import QuadraticPrior
 from sipe_bayes.structure.candidates import Candidate, candidates
 from sipe_bayes.structure.columns import Column, channels_of, choices, is_explained, log_jacobian, moving, unexplained
-from sipe_bayes.structure.comparison import choose_ties, difference
+from sipe_bayes.structure.comparison import choose_ties, difference, rank
 from sipe_bayes.structure.extension import Extension, Placed, members, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
 from sipe_bayes.structure.machine import Machine, machine_of
@@ -116,9 +116,16 @@ class StructureSearch:
 
         def simple(one: FittedStructure) -> tuple[int, bool, float]:
             native = all(self._placed[label].extension.native for label in one.labels)
-            return len(one.labels), not native, -difference(one, state.fitted[0]).nats
+            return len(one.labels), not native, -rank(one)[1]
 
-        return sorted(choose_ties([one for one in state.fitted if self.counts(state, one)]), key=simple)
+        counted = [one for one in state.fitted if self.counts(state, one)]
+        return sorted(choose_ties(counted, self._contains), key=simple)
+
+    def _contains(self, one: FittedStructure, other: FittedStructure) -> bool:
+        """Whether a structure has all of another one and more; shorter integration steps contain longer ones."""
+        pieces, rungs = self._ladder.pieces, [self._ladder.rung(each.labels) for each in (other, one)]
+        within = set(pieces(other.labels)) <= set(pieces(one.labels)) and rungs[0] <= rungs[1]
+        return within and set(one.labels) != set(other.labels)
 
     def enough(self, labels: Sequence[str]) -> int:
         """Rollouts that the fit of a structure may have."""
@@ -172,7 +179,8 @@ class StructureSearch:
             if one is not None and (not plain or is_explained(windows, one.sd, shown, column, own, options.gross)):
                 tried.append((one.evidence + log_jacobian(windows, column), column, one))
         if plain is None and not tried:
-            given.fit([], None, self.enough([]))  # raises what keeps the plain model from being fitted
+            plain = given.fit([], None, self.enough([]))  # or what keeps the plain model from being fitted is raised
+            return replace(state, fitted=(plain,), column_rollouts=spent)
         best = max(tried, key=lambda item: item[0], default=None)
         if best is None or (plain is not None and best[0] < plain.evidence + options.column_gain):
             return replace(state, column_rollouts=spent, untried=tuple(columns[number:]))
@@ -214,14 +222,15 @@ class StructureSearch:
         options, plain, queue = self.options, state.fitted[0], dict[frozenset[str], tuple[float, tuple[str, ...]]]()
         for labels in state.beam:
             here = state.of(labels)
-            before = 0.0 if here is None else difference(here, plain).nats
+            before = 0.0 if here is None else rank(here)[1] - rank(plain)[1]
             own = {offer.label: offer for offer in state.offers if offer.at == labels}  # the last of each
             for offer in own.values():
                 grown = self._grown(offer)
                 if offer.gain > options.least_gain and not state.is_tried(grown):
                     queue.setdefault(frozenset(grown), (before + offer.gain, grown))
         ranked = sorted(queue.values(), key=lambda item: -item[0])
-        level = ranked[0][0] - 2 * math.sqrt(2 * max(ranked[0][0], 0.0)) if ranked else 0.0
+        best = next((gain for gain, _ in ranked if math.isfinite(gain)), 0.0)  # none where shorter steps diverge
+        level = best - 2 * math.sqrt(2 * max(best, 0.0))
         most = 2 * options.width if state.beam == ((),) else options.width
         close = [(gain, grown) for gain, grown in ranked[options.width : most] if gain >= level]
         chosen = [grown for _, grown in ranked[: options.width] + close]
@@ -277,19 +286,16 @@ class StructureSearch:
 
     def _next_beam(self, state: DiscoverState) -> tuple[tuple[str, ...], ...]:
         """Labels of the best new structures that are clearly better than what they contain, and not clearly behind."""
-        plain, best = state.fitted[0], self._best(state)
+        best = max(state.fitted, key=rank)
         new = [one for one in state.fitted if one.labels not in state.ranked and not difference(best, one).clear]
-        better = [one for one in new if all(_is_better(one, part) for part in _parts(state, one))]
-        better.sort(key=lambda one: -difference(one, plain).nats)
-        return tuple(one.labels for one in better[: self.options.beam])
-
-    def _best(self, state: DiscoverState) -> FittedStructure:
-        """The structure that predicts best."""
-        return max(state.fitted, key=lambda one: difference(one, state.fitted[0]).nats)
+        better = [
+            one for one in new if all(_is_better(one, part) for part in state.fitted if self._contains(one, part))
+        ]
+        return tuple(one.labels for one in sorted(better, key=rank, reverse=True)[: self.options.beam])
 
     def _prune(self, state: DiscoverState) -> DiscoverState:
         """The best structure without one of its extensions, from where it ended itself."""
-        best = self._best(state)
+        best = max(state.fitted, key=rank)
         for left_out in best.labels:
             labels = tuple(label for label in best.labels if label != left_out)
             if labels not in state.pruned and labels not in state.failed:
@@ -342,16 +348,11 @@ def _is_better(one: FittedStructure, part: FittedStructure) -> bool:
     return gain.clear or (len(one.labels) == 1 and gain.nats > gain.error)
 
 
-def _parts(state: DiscoverState, one: FittedStructure) -> list[FittedStructure]:
-    """The fitted structures that one contains."""
-    return [other for other in state.fitted if set(other.labels) < set(one.labels)]
-
-
 def _merged(fitted: tuple[FittedStructure, ...], before: FittedStructure) -> tuple[FittedStructure, ...]:
     """With the better one of two fits of a structure, the later of which comes last, in the place of the first."""
     *rest, again = fitted
     if again is before or set(again.labels) != set(before.labels):
         return fitted
-    better = again if again.evidence > before.evidence else before
+    better = again if again.evidence > before.evidence and again.settled >= before.settled else before
     better = replace(better, labels=before.labels, rollouts=before.rollouts + again.rollouts)
     return tuple(better if one is before else one for one in rest)

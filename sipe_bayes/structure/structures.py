@@ -101,7 +101,7 @@ class Structures:
         for parameter, theta in zip(own, here.theta[len(here.theta) - len(own) :], strict=True):
             sizes.append(f"{parameter.targets[0]} {float(parameter.value(theta)):.3g} {parameter.unit}".rstrip())
         kept = " + ".join(here.labels) + (f" ({', '.join(sizes)})" if sizes else "")
-        return f"{count}, kept so far {kept}, {here.evidence - self.plain.evidence:.0f} nats over the model as it was"
+        return f"{count}, the best so far {kept}, {difference(here, self.plain).nats:.0f} nats over the model as it was"
 
     @cached_property
     def supported(self) -> tuple[FittedStructure, ...]:
@@ -171,18 +171,18 @@ class Structures:
 
     @property
     def posterior(self) -> GaussianMixture:
-        """Of the user's parameters, averaged over the structures."""
+        """Of the user's parameters, stacked over the structures."""
         space = self.search.fitting.prior.space
-        return self._averaged(space, [(p, one, 0) for p, one in self._weighed()])
+        return self._stacked(space, [(p, one, 0) for p, one in self._weighed()])
 
     def posterior_of_piece(self, label: str) -> GaussianMixture:
-        """Of the parameters of an extension of the best structure, averaged over the structures that have it."""
+        """Of the parameters of an extension of the best structure, stacked over the structures that have it."""
         having = []
         for p, one in self._weighed():
             if label in one.labels:
                 before = sum(len(self.search.placed[o].parameters) for o in one.labels[: one.labels.index(label)])
                 having.append((p, one, len(self.search.fitting.prior.space) + before))
-        return self._averaged(ParameterSpace(self.search.placed[label].parameters), having)
+        return self._stacked(ParameterSpace(self.search.placed[label].parameters), having)
 
     def _weighed(self) -> list[tuple[float, FittedStructure]]:
         """Structures of the set, with their weights."""
@@ -190,7 +190,7 @@ class Structures:
         return [(p, one) for p, one in pairs if p > _NEGLIGIBLE]
 
     @staticmethod
-    def _averaged(space: ParameterSpace, parts: Sequence[tuple[float, FittedStructure, int]]) -> GaussianMixture:
+    def _stacked(space: ParameterSpace, parts: Sequence[tuple[float, FittedStructure, int]]) -> GaussianMixture:
         """The mixture of the normals that structures have for the parameters of a space, each from an index on."""
         own = [(one, slice(first, first + len(space))) for _, one, first in parts]
         means = np.stack([one.mean[at] for one, at in own])

@@ -65,8 +65,8 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
     "a tie": (
         make_discovery(FRICTION, tied=(TWIN,)),
         "fair",
-        "Not distinguishable from it: drag at hinge (difference -4.0 ± 9.0 nats). The simplest of them, dry friction "
-        "at hinge, is written to discovered.xml. More logs, or other motions, may tell.",
+        "These structures predict the logs as well: drag at hinge (difference -4.0 ± 9.0 nats). The simplest of "
+        "them, dry friction at hinge, is written to discovered.xml. More logs, or other motions, may tell.",
     ),
     "a tie, parts of the logs": (
         dataclasses.replace(
@@ -88,7 +88,7 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
     "not settled, no fact": (
         changed(FRICTION, settled=False),
         "bad",
-        "were fitted to their end; of these, the best has",
+        "were fitted to their end; of these, the simplest of the best has",
     ),
     "cut short": (changed(FRICTION, settled=False, findings=(CUT,)), "bad", "--budget 60000, and the same folder"),
     "cut short, wider": (
@@ -172,7 +172,7 @@ def test_page_says_it_all_and_escapes_names() -> None:
         "MJCF has no element for stribeck at hinge",
         "The nearest element is LuGre",
         "Delay at angle is of the measurement and has no place in discovered.xml",
-        "Not distinguishable from it: drag at hinge (difference -4.0 ± 9.0 nats)",
+        "These structures predict the logs as well: drag at hinge (difference -4.0 ± 9.0 nats)",
         "a spring at hinge +2.0 not to its end",
         "Next: sipe calibrate runs/pendulum-discover/discovered.toml",
     ):

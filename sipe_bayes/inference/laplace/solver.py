@@ -428,7 +428,7 @@ class SegmentSolver:
             return replace(state, here=replace(here, stage=Stage.FIT, residual=None, starts_jacobian=None))
         after, more = step.after, self._next_part(Stage.PLAIN, here.part, here.enough > 0)
         enough = self._plain_enough(view, here, step.lin.residual)
-        if here.part == 0 and more and self._share(len(self._beginnings) + 1) >= 1:  # a quarter of little
+        if here.part == 0 and more and not self._beginnings and self._share(1) >= 1:  # a quarter of little
             open_directions = np.linalg.eigvalsh(step.hessian)[0] < 1 / 0.1**2  # it would lead astray along them
             enough = np.inf if open_directions else max(0.2 * view.observed.sum(), enough)
         elif here.part == 0 and more:

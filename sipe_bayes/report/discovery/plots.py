@@ -90,7 +90,7 @@ def _correlation(ax: Axes, row: Residual, colour: str) -> None:
 
 @styled
 def values(discovery: Discovery) -> list[Figure]:
-    """The user's parameters, those of single logs aside: 90 % intervals before, and averaged over structures."""
+    """The user's parameters, those of single logs aside: 90 % intervals before, and stacked over structures."""
     plain = {p.name: p for p in discovery.plain_parameters}
     pairs = [(plain[p.name], p) for p in discovery.parameters if not p.nuisance]
     return [_value_figure(part) for part in equal_parts(pairs, SIZES.parameters)]
@@ -108,6 +108,6 @@ def _value_figure(rows: Sequence[tuple[ParameterSummary, ParameterSummary]]) -> 
         ax.set_title(with_unit(shortened(pair[0].name, 30), pair[0].unit), loc="left")
         ticks(ax.xaxis, 4)
     legend_above(
-        figure, [line_handle(DEFAULT, BEFORE, lw=2.5), line_handle(POSTERIOR, "averaged over structures", lw=2.5)], 2
+        figure, [line_handle(DEFAULT, BEFORE, lw=2.5), line_handle(POSTERIOR, "stacked over structures", lw=2.5)], 2
     )
     return figure

@@ -75,7 +75,7 @@ def headline(discovery: Discovery) -> Verdict:
         among = f"Not all of the {len(discovery.rows)} structures were fitted to their end; of these"
         if cut_short(discovery):
             among = f"Of the {len(discovery.rows)} structures that were fitted before the budget was spent"
-        return Verdict("bad", f"{among}, the best has {kept}.")
+        return Verdict("bad", f"{among}, the simplest of the best has {kept}.")
     if kept:
         best = discovery.rows[0]
         gain = f"the log predictive density rises by {with_error(best.gain, best.error).lstrip('+')} nats"
@@ -92,7 +92,7 @@ def headline(discovery: Discovery) -> Verdict:
 
 
 def held_out_verdict(discovery: Discovery) -> Verdict | None:
-    """Whether the extended model foretells held-out logs better than the calibrated plain one."""
+    """Whether the extended model predicts held-out logs better than the calibrated plain one."""
     comparison = discovery.comparison
     if comparison is None:
         if not discovery.kept or any(row.use == "holdout" for row in discovery.errors):
@@ -118,7 +118,8 @@ def ties(discovery: Discovery) -> Verdict | None:
     would = "Logs cut to where they differ, or other motions," if parts else "More logs, or other motions,"
     written = f"The simplest of them, {structure_text(discovery.rows[0])}, is written to discovered.xml."
     return Verdict(
-        "fair", f"Not distinguishable from it: {listed([*others[:_NAMED], *more])}. {written} {would} may tell."
+        "fair",
+        f"These structures predict the logs as well: {listed([*others[:_NAMED], *more])}. {written} {would} may tell.",
     )
 
 
@@ -200,7 +201,7 @@ def error_line(row: ModelErrors) -> str:
 
 
 def value_rows(discovery: Discovery) -> list[dict[str, str]]:
-    """The user's parameters averaged over structures, beside those of the plain model; then those that were added."""
+    """The user's parameters stacked over structures, beside those of the plain model; then those that were added."""
     rows = []
     plain = {p.name: p for p in discovery.plain_parameters}
     for p in (*discovery.parameters, *discovery.added):

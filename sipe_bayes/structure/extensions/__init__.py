@@ -1,1 +1,1 @@
-"""Extensions: one file each, by what they are placed at."""
+"""Extensions: one file for each kind of place."""
