@@ -30,8 +30,6 @@ from sipe_bayes.structure.fitted import FittedStructure
 
 _ERRORS = 2.0  # standard errors within which structures are ties
 _ALIKE = 0.5  # largest correlation of neighbours: motions that tell more follow each other, too
-_LEAST = 0.01  # weight of a tie
-_ROUNDS = 200  # of the weights' iteration, which never lowers what it maximises
 
 
 class Difference(NamedTuple):
@@ -87,7 +85,7 @@ def stack(structures: Sequence[FittedStructure]) -> FloatArray:
     densities = np.stack([one.held.density for one in structures], axis=1)
     densities = densities[np.isfinite(densities).all(1)]
     densities = np.exp(densities - densities.max(1, keepdims=True, initial=-np.inf))
-    for _ in range(_ROUNDS if len(densities) else 0):
+    for _ in range(200 if len(densities) else 0):  # a round never lowers what it maximises
         weight = weight * (densities / (densities @ weight)[:, None]).mean(0)
-    weight = np.maximum(weight / weight.sum(), _LEAST)
+    weight = np.maximum(weight / weight.sum(), 0.01)
     return weight / weight.sum()

@@ -200,6 +200,3 @@ def _pieces(windows: BoundLikelihood, parts: list[BoolArray], density: FloatArra
     count = np.array([max(samples[part].sum(), 1) for part in parts])
     square = (-2 * density - np.array([constants[part].sum() for part in parts])) / count
     return Pieces(density, np.array([windows.log[part][0] for part in parts], np.int64), square)
-
-
-NO_PIECES = Pieces(np.zeros(0), np.zeros(0, np.int64), np.zeros(0))

@@ -19,13 +19,14 @@ from sipe_bayes.structure import DiscoverOptions, Extension, Restriction, Struct
 from sipe_bayes.structure.columns import Column, channels_of, choices, log_jacobian, moving, unexplained
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.machine import Machine
-from sipe_bayes.structure.scores import NO_PIECES
+from sipe_bayes.structure.scores import Pieces
 from sipe_bayes.structure.state import DiscoverState, Phase
 from tests.problems.machines import MACHINES, environment
 from tests.problems.pendulums import log, pendulum
 
 FRICTION = Parameter("friction", 0.0, 0.3, targets=("joint:hinge.frictionloss",))
 DRAG = Parameter("drag", 0.0, 0.3, targets=("joint:hinge.damping_quadratic",))
+NO_PIECES = Pieces(np.zeros(0), np.zeros(0, np.int64), np.zeros(0))
 NAMES = ("dry_friction", "quadratic_damping", "delay", "offset", "spring")
 
 
