@@ -125,7 +125,7 @@ def _untried(structures: Structures) -> str:
     """Pieces that a search whose budget was spent did not try, or not to the end, in words."""
     state, search = structures.state, structures.search
     if state.cut is Phase.FIT:
-        names = list(dict.fromkeys(search.placed[labels[-1]].sentence for labels in state.queue))
+        names = [" with ".join(search.placed[label].sentence for label in labels) for labels in state.queue]
     elif state.cut in (Phase.COLUMNS, Phase.RANK):
         there = structures.best.labels
         names = [p.sentence for p in search.placed.values() if p.parameters and p.label not in there]

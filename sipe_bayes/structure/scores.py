@@ -91,8 +91,8 @@ def scores(
     evidence = _Linear(windows, theta, starts, prior).evidence(products, float(constants.sum()))
     parts = _parts(windows)
     if len(parts) < 2 or len(products) < len(windows.log):
-        whole = [np.ones(windows.num_windows, bool)]
-        return Scores(evidence, _pieces(windows, whole, np.array([evidence]), constants))
+        every = [np.ones(windows.num_windows, bool)]
+        return Scores(evidence, _pieces(windows, every, np.array([evidence]), constants))
     windows = windows.cut(np.array([part.argmax() for part in parts]))
     products, constants = windows.moments(linearisation).normal(noise), _log_determinants(windows, noise)
     linear = _Linear(windows, theta, starts, prior)

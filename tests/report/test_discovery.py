@@ -75,6 +75,13 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
         "fair",
         "Logs cut to where they differ, or other motions, may tell.",
     ),
+    "not needed": (
+        dataclasses.replace(
+            make_discovery(FRICTION), rows=(row("dry", weight=1.0), row("dry", "cogging", behind=-9.0))
+        ),
+        "fair",
+        "Adding cogging gains +9.0 ± 9.0 nats: less than two standard errors, so it is left out.",
+    ),
     "noise": (make_discovery(FRICTION), "good", "What remains passes for noise (p = 0.4)."),
     "share": (make_discovery(FRICTION), "good", "Pieces with a name explain 80 %"),
     "small": (changed(FRICTION, **left(SMALL)), "fair", "something small, like drag at hinge"),

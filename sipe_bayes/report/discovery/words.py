@@ -109,18 +109,22 @@ def held_out_verdict(discovery: Discovery) -> Verdict | None:
 
 
 def ties(discovery: Discovery) -> Verdict | None:
-    """Which structures the logs do not tell apart, and what would."""
-    others = [alternative_text(row) for row in alternatives(discovery)]
-    if not others:
-        return None
-    more = [f"{len(others) - _NAMED} more"] if len(others) > _NAMED else []
-    parts = any(one.code is Code.SEARCHED_ON_PARTS for one in discovery.findings)
-    would = "Logs cut to where they differ, or other motions," if parts else "More logs, or other motions,"
-    written = f"The simplest of them, {structure_text(discovery.rows[0])}, is written to discovered.xml."
-    return Verdict(
-        "fair",
-        f"These structures predict the logs as well: {listed([*others[:_NAMED], *more])}. {written} {would} may tell.",
-    )
+    """Which structures the logs do not tell apart, what would, and what is left out since it is not needed."""
+    others, best, texts = [alternative_text(row) for row in alternatives(discovery)], discovery.rows[0], list[str]()
+    if others:
+        more = [f"{len(others) - _NAMED} more"] if len(others) > _NAMED else []
+        parts = any(one.code is Code.SEARCHED_ON_PARTS for one in discovery.findings)
+        would = "Logs cut to where they differ, or other motions," if parts else "More logs, or other motions,"
+        texts.append(f"These structures predict the logs as well: {listed([*others[:_NAMED], *more])}.")
+        texts.append(f"The simplest of them, {structure_text(best)}, is written to discovered.xml. {would} may tell.")
+    larger = max((row for row in discovery.rows if not row.yardstick), key=lambda row: row.gain)
+    if not larger.tied and larger.gain > best.gain and set(best.labels) < set(larger.labels):
+        added = listed(
+            [x for x, label in zip(larger.sentences, larger.labels, strict=True) if label not in best.labels]
+        )
+        gain = with_error(-larger.behind, larger.behind_error)
+        texts.append(f"Adding {added} gains {gain} nats: less than two standard errors, so it is left out.")
+    return Verdict("fair", " ".join(texts)) if texts else None
 
 
 def remains(discovery: Discovery) -> Verdict | None:
