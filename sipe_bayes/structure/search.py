@@ -204,7 +204,7 @@ class StructureSearch:
         return one, one.rollouts
 
     def _rank(self, state: DiscoverState) -> DiscoverState:
-        """What extensions promise beside one structure of the beam; or which structures are to be fitted."""
+        """Predicted gains beside one structure of the beam; or which structures are to be fitted."""
         for labels in state.beam:
             if labels not in state.ranked and len(self._ladder.pieces(labels)) < self.options.most:
                 here = state.of(labels)
@@ -245,7 +245,7 @@ class StructureSearch:
     def _ranked(
         self, state: DiscoverState, here: FittedStructure, last_resort: bool
     ) -> tuple[DiscoverState, list[Candidate]]:
-        """What extensions promise beside a structure, best first, and the state with it; cut where little is left."""
+        """Predicted gains beside a structure, best first, and the state with them; cut where the budget ends."""
         fitting, own = self.fitting, self.structure(here.labels)
         simulator = fitting.simulator(own)
         windows, prior = fitting.windows(simulator), QuadraticPrior.of(fitting.prior_of(simulator))

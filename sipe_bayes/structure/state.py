@@ -1,4 +1,4 @@
-"""How structures are searched, and where a search stands: what was fitted, what was promised, what comes next."""
+"""How structures are searched, and where a search stands: what was fitted, predicted gains, what comes next."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ class Phase(enum.Enum):
 
 @dataclass(frozen=True)
 class Offer:
-    """What an extension promised at a structure.
+    """The predicted gain of an extension beside a structure.
 
     Args:
         at: labels of the structure.
         label: of the extension.
-        gain: promised log-likelihood in nats.
+        gain: predicted gain of the log likelihood, in nats.
         theta: (P,), where its parameters are to start.
         others: (N,), where those of the structure then are to.
     """

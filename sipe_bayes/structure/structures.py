@@ -95,7 +95,7 @@ class Structures:
         self.search.place(self.state)
         here = self.best
         if not here.labels:
-            return f"{count}, nothing kept so far"
+            return f"{count}, no extension is supported so far"
         sizes = []
         own = [parameter for piece in self.placed(here) for parameter in piece.parameters]
         for parameter, theta in zip(own, here.theta[len(here.theta) - len(own) :], strict=True):
@@ -145,7 +145,7 @@ class Structures:
         return dict(sorted(sums.items(), key=lambda item: (-item[1], item[0])))
 
     def offers(self, at: Sequence[str] = ()) -> list[Offer]:
-        """What was promised at a structure, best first."""
+        """Predicted gains beside a structure, best first."""
         return sorted((o for o in self.state.offers if set(o.at) == set(at)), key=lambda o: -o.gain)
 
     def table(self) -> list[StructureRow]:

@@ -33,9 +33,9 @@ mass from its joint give a pendulum one period. Plain fits go down from four poi
 best draws of the prior where residuals are larger than ``poor`` times the samples' scatter; first on half seconds of
 few segments, mostly a twentieth of the cost so far, then on the smallest part. One that leads back to an optimum in
 every direction is given up. If one ends elsewhere, fits as well, and what lies between fits worse, FIT follows it. From
-known states FIT also follows an end that fits clearly better than a
-poor optimum. All optima are kept, weighted by their evidence. Where simulations from measured initial states miss the
-log by far more than the noise, plain fits tell nothing: a poor fit is followed by one from the best draw, no other.
+known states FIT also follows an end that fits clearly better than a poor optimum. All optima are kept, weighted by
+their evidence. Where simulations from measured initial states miss the log by far more than the noise, plain fits tell
+nothing: a poor fit is followed by one from the best draw, no other.
 
 **Impacts** make simulations jump. There beginnings of the segments are fitted first, two control steps and then ever
 more. On the shortest ones plain fits go down from the nominal model and the best of some draws from the prior; the best
