@@ -45,7 +45,7 @@ from sipe_bayes.calibration.readers.many import episodes_of
 from sipe_bayes.core.files import read_text, reading
 from sipe_bayes.core.units import find_unit
 from sipe_bayes.core.validation import MOST
-from sipe_bayes.diagnostics.misfit.tolerances import GEOMETRY, PHYSICS_STEPS, TIMING
+from sipe_bayes.structure.tolerances import GEOMETRY, PHYSICS_STEPS, TIMING
 
 
 class Config(Table):

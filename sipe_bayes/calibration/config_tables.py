@@ -33,7 +33,7 @@ from sipe_bayes.calibration.config_fields import (
 )
 from sipe_bayes.calibration.readers.many import matching, names_of
 from sipe_bayes.core.units import find_unit
-from sipe_bayes.diagnostics.misfit.tolerances import COMMANDS
+from sipe_bayes.structure.tolerances import COMMANDS
 
 
 class TimeColumn(Table):

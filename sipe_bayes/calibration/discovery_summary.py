@@ -27,9 +27,7 @@ from sipe_bayes.diagnostics.evaluate import (
     measured_starts,
     signals,
 )
-from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
-from sipe_bayes.diagnostics.misfit.misspecification import misfit
-from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
+from sipe_bayes.diagnostics.misfit import misfit
 from sipe_bayes.diagnostics.records import Comparison, Signal
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.unknowns import bounded_by_nature
@@ -37,8 +35,10 @@ from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood import BoundLikelihood, QuadraticPrior
 from sipe_bayes.posterior import Particles
 from sipe_bayes.posterior import prior as default_prior
+from sipe_bayes.structure.augmented import AugmentedModel
 from sipe_bayes.structure.columns import corrected
 from sipe_bayes.structure.comparison import difference, rank
+from sipe_bayes.structure.discrepancy import Discrepancy, find_discrepancy
 from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.state import Phase
@@ -185,26 +185,22 @@ class _Model:
         return Marginals.of(self.structures.posterior_of(self.one), prior, seed, natural).summaries()
 
     @functools.cached_property
-    def probed(self) -> ProbedLogs | None:
-        """The training logs as the checks of their residuals see them; None where the simulation diverges."""
+    def found(self) -> Discrepancy | None:
+        """What it lacks, or may lack, by the training logs; None where the simulation diverges."""
         fitting, one = self.structures.search.fitting, self.one
         windows = fitting.windows(self.structures.simulator(one))
         prior = QuadraticPrior.of(fitting.prior_of(windows.simulator))
         try:
-            return ProbedLogs(
+            logs = AugmentedModel(
                 windows, one.theta, one.noise, one.starts, prior, tell=self.tell, extensions=self.extensions
             )
+            return find_discrepancy(logs, self.problem.tolerances)
         except ValueError:  # LinAlgError is one
             return None
 
     def further(self, seed: int) -> Particles | None:
         """Of all parameters that a further log would ask for; None where that cannot be said."""
-        if self.probed is None:
-            return None
-        prior = self.structures.search.fitting.prior_of(self.structures.simulator(self.one))
-        own = self.structures.posterior_of(self.one)
-        missing = missing_physics(self.probed, own, prior, True, seed, self.problem.tolerances)
-        return None if missing is None else missing.further
+        return None if self.found is None else self.found.draw(self.structures.posterior_of(self.one), seed)
 
     def stage(self, seed: int) -> Stage:
         """What it leaves of the training logs."""
@@ -213,7 +209,7 @@ class _Model:
         windows, one = fitting.windows(simulator), self.one
         residuals = fitted_residuals(windows, one.theta, one.noise, one.starts)
         sd = self.structures.posterior_of(one).stddev.numpy()
-        seen = None if self.probed is None else misfit(self.probed, sd, seed)
+        seen = None if self.found is None else misfit(self.found, sd, seed)
         return Stage(channel_noise(windows, one.noise), seen, tuple(residuals))
 
 

@@ -23,7 +23,6 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.units import find_unit, to_si
 from sipe_bayes.core.validation import nearest_name
-from sipe_bayes.diagnostics.misfit.tolerances import Tolerances
 from sipe_bayes.diagnostics.records import LogReport
 from sipe_bayes.envs.added import of_logs
 from sipe_bayes.envs.channels import Channel
@@ -39,6 +38,7 @@ from sipe_bayes.likelihood import Segments, StateSpace
 from sipe_bayes.posterior import GaussianMixture, Posterior, load_posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.structure.tolerances import Tolerances
 
 _FLAT_SD = 1e3  # stands for a uniform prior beside an earlier posterior
 RUN = "run.json"

@@ -179,7 +179,7 @@ def _checked(problem: Problem, method: Estimator, first: Calibration, checks: Ch
     )
     bands = check(
         Check.BANDS,
-        lambda: predictions.value.bands(posterior, lacks.physics(space) if doubted else None, seed, checks),
+        lambda: predictions.value.bands(posterior, further if doubted else None, seed, checks),
     ).otherwise({})
     dead = check(Check.RANGES, lambda: ranges_that_change_nothing(fit.value, checks)).otherwise({})
     return _Answers(

@@ -254,7 +254,7 @@ class Code(Enum):
         "the model explains the logs but for {share:.0e} of what they move, as where they were simulated without "
         "noise: what is left is rounding, and says nothing of the model; the intervals are those of rounding too"
     )
-    UNTOLD = note("these logs can not tell {causes}; then values are off by more than the sd that they have: {moved}")
+    UNTOLD = note("no motion tells these numbers, and values hang on them by more than their sd: {moved}")
     CHECKS_THINNED = note("of the fit's {windows} windows {asked}, spread evenly, were asked what the model lacks")
     RESIDUALS_LEFT_OUT = note(
         "Residuals, and whether they are noise: with likelihood = 'state_space' the state is unknown at every sample, "

@@ -31,7 +31,6 @@ from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.laplace import Laplace
-from sipe_bayes.inference.random_effects import LogEstimate
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood import UNIFORM_PRECISION, BoundLikelihood, Linearisation, Noise, Segments, StateSpace
 from sipe_bayes.simulation.simulator import Simulator
@@ -40,6 +39,21 @@ LOG_BUDGET = 5000  # rollouts for each log
 _PIECES = 5  # of a single log, where there is no other to compare it with
 _DETERMINED = (1 - THRESHOLDS.not_determined) / math.sqrt(12)  # sd of a log that tells a parameter: of the prior's
 _FLAT = 1e-6  # precision that keeps a log's information invertible where it leaves a direction open
+
+
+@dataclass(frozen=True)
+class LogEstimate:
+    """One log by itself.
+
+    Args:
+        name: of the log.
+        mean: (N,) in theta.
+        information: (N, N) in theta.
+    """
+
+    name: str
+    mean: FloatArray
+    information: FloatArray
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """The method ``calibrate``: ``laplace`` with what the model lacks or may lack, which ``sipe calibrate`` shows first.
 
-That is the interval of ``diagnostics.misfit.missing_physics``; nothing is put into a model here. Where the residuals
+That is the interval of ``structure.discrepancy``; nothing is put into a model here. Where the residuals
 are no noise it asks for windows: a log that was fitted whole from its known start is fitted again in windows of half a
 second, within the same budget. Only of a user's MJCF, which extensions are made for; elsewhere it is ``laplace``. Of a
 simulator that makes its own noise there is no likelihood: there it is what ``laplace`` then names in its place,
@@ -18,15 +18,15 @@ from sipe_bayes.benchmark.leaderboard.run import DRAWS, Estimate, OwnMethod, dra
 from sipe_bayes.benchmark.leaderboard.task import Case, Problem, Task
 from sipe_bayes.calibration.gathered import most_probable
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
-from sipe_bayes.diagnostics.misfit.misspecification import misfit
-from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
-from sipe_bayes.diagnostics.misfit.tolerances import usual
+from sipe_bayes.diagnostics.misfit import misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.arguments import without_likelihood
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.likelihood import QuadraticPrior, Segments, bind
 from sipe_bayes.posterior import Posterior
+from sipe_bayes.structure.augmented import AugmentedModel
+from sipe_bayes.structure.discrepancy import Discrepancy, find_discrepancy
+from sipe_bayes.structure.tolerances import Tolerances, usual
 
 NAME = "calibrate"
 
@@ -39,8 +39,8 @@ class _Fit:
     posterior: Posterior
     logs: Trajectories
 
-    def probed(self) -> ProbedLogs:
-        """The logs linearised at the estimate."""
+    def found(self, tolerances: Tolerances) -> Discrepancy:
+        """What the model lacks, or may lack, to first order."""
         method, theta = self.method, self.posterior.mode.numpy()
         assert isinstance(method.likelihood, Segments)
         windows = bind(method.likelihood, method.simulator, self.logs)
@@ -48,7 +48,8 @@ class _Fit:
         starts = method.result.starts_at(theta)
         assert starts is not None
         prior, linearised = QuadraticPrior.of(method.prior), windows.linearise(theta, starts)
-        return ProbedLogs(windows, theta, method.result.noise, starts, prior, linearised)
+        logs = AugmentedModel(windows, theta, method.result.noise, starts, prior, linearised)
+        return find_discrepancy(logs, tolerances)
 
 
 class Calibrate:
@@ -70,14 +71,12 @@ class Calibrate:
         fit = self._fit(problem, given, logs, task.budget)
         posterior, rollouts, best = fit.posterior, fit.method.rollouts, most_probable(fit.posterior)
         if isinstance(problem.simulator.environment, MjcfEnvironment):
-            probed = fit.probed()
-            doubted = misfit(probed, posterior.stddev.numpy(), self.seed).alarm
-            if doubted and given.starts == "recorded":
-                fit = self._fit(problem, Segments(), replace(logs, states=None), task.budget - rollouts)
-                rollouts, probed = rollouts + fit.method.rollouts, fit.probed()
             known = usual(problem.simulator.environment.actuators)
-            missing = missing_physics(probed, fit.posterior, problem.prior, doubted, self.seed, known)
-            posterior = posterior if missing is None else missing.further
+            found = fit.found(known)
+            if given.starts == "recorded" and misfit(found, posterior.stddev.numpy(), self.seed).alarm:
+                fit = self._fit(problem, Segments(), replace(logs, states=None), task.budget - rollouts)
+                rollouts, found = rollouts + fit.method.rollouts, fit.found(known)
+            posterior = found.draw(fit.posterior, self.seed)
         drawn = posterior.values(DRAWS, draws_of(self.seed, problem, case))
         return Estimate(drawn, rollouts, problem.space.values(best))
 

@@ -15,27 +15,19 @@ from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
+from sipe_bayes.diagnostics.agreement import LogEstimate
 from sipe_bayes.diagnostics.evaluate import fitted_residuals
-from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics, missing_physics, spread_alone
-from sipe_bayes.diagnostics.misfit.misspecification import misfit
-from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
-from sipe_bayes.diagnostics.misfit.tolerances import tolerance_findings, untold
+from sipe_bayes.diagnostics.misfit import misfit
 from sipe_bayes.diagnostics.records import Misfit, Residual
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.random_effects import LogEstimate
 from sipe_bayes.inference.recorded import Tell
 from sipe_bayes.likelihood import QuadraticPrior, StateSpace
 from sipe_bayes.posterior import Particles, Posterior
+from sipe_bayes.structure.augmented import AugmentedModel
+from sipe_bayes.structure.discrepancy import Discrepancy, draw_differing, find_discrepancy
+from sipe_bayes.structure.physics_step import PHYSICS_STEP
 
-
-@dataclass(frozen=True)
-class _Missing:
-    """A ``MissingPhysics`` as it is kept: draws (M, N) of theta with their weights (M,)."""
-
-    theta: FloatArray
-    weights: FloatArray
-    causes: tuple[str, ...]
-    explained: bool
+_NAMED = 3  # numbers that no motion tells
 
 
 @dataclass(frozen=True)
@@ -44,35 +36,24 @@ class Lacking:
 
     Args:
         misfit: what they look like; None where that was not asked, or cannot be told.
-        missing: theta with what the model lacks, or may lack, to first order.
+        theta: (M, N) draws with what the model lacks, or may lack, to first order; None where that cannot be told.
+        causes: for which these allow, in words.
         residuals: of each log and channel; none with a ``StateSpace``, whose process noise takes what the model lacks.
         findings: of what they cannot tell, and of numbers that no motion tells.
     """
 
     misfit: Misfit | None
-    missing: _Missing | None
+    theta: FloatArray | None
+    causes: tuple[str, ...]
     residuals: tuple[Residual, ...]
     findings: tuple[Finding, ...]
 
     def further(self, space: ParameterSpace) -> Particles | None:
         """Theta with what the model lacks, or may lack."""
-        given = self.missing
-        return None if given is None else Particles(given.theta, space, weights=given.weights)
-
-    @property
-    def causes(self) -> tuple[str, ...]:
-        """For which ``further`` allows."""
-        return () if self.missing is None else self.missing.causes
-
-    def physics(self, space: ParameterSpace) -> MissingPhysics | None:
-        """What the model lacks, or may lack, to first order."""
-        if self.missing is None:
-            return None
-        further = Particles(self.missing.theta, space, weights=self.missing.weights)
-        return MissingPhysics(further, self.missing.causes, self.missing.explained)
+        return None if self.theta is None else Particles(self.theta, space)
 
 
-NOTHING_ASKED = Lacking(None, None, (), ())
+NOTHING_ASKED = Lacking(None, None, (), (), ())
 
 
 def lacking(
@@ -98,29 +79,24 @@ def lacking(
 
     def made(tell: Tell, kept: Kept) -> Lacking:
         unknown: list[Finding] = []
-        probed = _probed(problem, fit, unknown, tell, kept)
+        found = _found(problem, fit, unknown, tell, kept)
         chain = isinstance(problem.likelihood, StateSpace)
         residuals = [] if chain else fitted_residuals(fit.windows, fit.theta, fit.noise, fit.starts)
-        looks = None if probed is None else misfit(probed, posterior.stddev.numpy(), method.seed, estimate=fit.theta)
-        tell("intervals with it")
-        given = problem.prior, conflict or (looks is not None and looks.alarm), method.seed
-        if probed is None:
-            missing = spread_alone(alone, *given)
-        else:
-            missing = missing_physics(probed, posterior, *given, problem.tolerances)
-        plain = None if missing is None else _plain(missing)
-        return Lacking(looks, plain, tuple(residuals), tuple(unknown))
+        if found is None:
+            differ = (
+                draw_differing(posterior, alone, method.seed).theta.numpy() if conflict and len(alone) > 1 else None
+            )
+            return Lacking(None, differ, (), tuple(residuals), tuple(unknown))
+        tell("comparing with noise alone")
+        looks = misfit(found, posterior.stddev.numpy(), method.seed)
+        further = found.draw(posterior, method.seed)
+        return Lacking(looks, further.theta.numpy(), found.causes, tuple(residuals), tuple(unknown))
 
     return checks.of(Check.LACKING, Lacking, made)
 
 
-def _plain(missing: MissingPhysics) -> _Missing:
-    further = missing.further
-    return _Missing(further.theta.numpy(), further.weights.numpy(), missing.causes, missing.explained)
-
-
-def _probed(problem: Problem, fit: Fit, unknown: list[Finding], tell: Tell, kept: Kept) -> ProbedLogs | None:
-    """The logs as the checks of their residuals see them; unknown: gets findings of what they cannot tell."""
+def _found(problem: Problem, fit: Fit, unknown: list[Finding], tell: Tell, kept: Kept) -> Discrepancy | None:
+    """What the model lacks to first order; unknown: gets findings of what the logs cannot tell."""
     if isinstance(problem.likelihood, StateSpace):
         return None
     left = float(np.max(fit.noise.sd / np.maximum(fit.windows.spread, np.finfo(float).tiny)))
@@ -132,12 +108,36 @@ def _probed(problem: Problem, fit: Fit, unknown: list[Finding], tell: Tell, kept
         return None
     windows, starts, prior = fit.windows.part(fit.some), fit.starts[fit.some], QuadraticPrior.of(problem.prior)
     try:
-        probed = ProbedLogs(windows, fit.theta, fit.noise, starts, prior, fit.lin, tell, kept)
-        if probed.windows.num_windows < fit.windows.num_windows:
-            asked, every = probed.windows.num_windows, fit.windows.num_windows
+        logs = AugmentedModel(windows, fit.theta, fit.noise, starts, prior, fit.lin, tell, kept)
+        if logs.windows.num_windows < fit.windows.num_windows:
+            asked, every = logs.windows.num_windows, fit.windows.num_windows
             unknown.append(finding(Code.CHECKS_THINNED, asked=asked, windows=every))
-        unknown.extend(tolerance_findings(probed, untold(probed, problem.tolerances)))
+        tell("extensions that may be at work")
+        found = find_discrepancy(logs, problem.tolerances)
+        unknown.extend(untold(found))
     except ValueError as error:  # LinAlgError is one
         unknown.append(finding(Code.CHECKS_SKIPPED, checks=Check.LACKING.value, reason=error))
         return None
-    return probed
+    return found
+
+
+def untold(found: Discrepancy) -> list[Finding]:
+    """Of numbers with a tolerance that move a value by more than an sd of what the logs tell, the largest first."""
+    logs = found.at.logs
+    variance, space = np.diag(logs.seen.projected.covariance), logs.windows.simulator.space
+    sd = np.sqrt(np.where(variance > 0, variance, np.inf))  # nothing moves what is held by its bound
+    moving = [one for one in found.contributions() if (one.shift > sd).any()]
+    moving.sort(key=lambda one: -float((one.shift / sd).max()))
+    hangs, said = np.zeros(len(space), bool), []
+    for one in moving[:_NAMED]:
+        ends = space.values(np.clip([logs.theta - one.shift, logs.theta, logs.theta + one.shift], 0, 1))
+        off = np.abs(np.diff(ends, axis=0)).max(0)
+        moved = [
+            f"{space[j].name} by {off[j]:.2g} {space[j].unit}".rstrip() for j in np.flatnonzero(one.shift > sd).tolist()
+        ]
+        said.append(f"{one.sentence} ({', '.join(moved)})")
+    for one in moving:
+        if one.probe.extension is not PHYSICS_STEP:  # the interval allows for steps
+            hangs |= one.shift > sd
+    names = [space[j].name for j in np.flatnonzero(hangs).tolist()]
+    return [finding(Code.UNTOLD, parameters=names, moved="; ".join(said))] if said else []

@@ -17,7 +17,6 @@ from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.bands import predictive_bands
 from sipe_bayes.diagnostics.evaluate import both_predicted, channel_scores, compare_errors, signals
-from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, follows, outside_prior
 from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Signal
 from sipe_bayes.inference.base import Estimator
@@ -79,12 +78,12 @@ class Predictions:
         return checks.of(Check.COMPARISON, Compared, made)
 
     def bands(
-        self, posterior: Posterior, missing: MissingPhysics | None, seed: int, checks: Checks
+        self, posterior: Posterior, further: Posterior | None, seed: int, checks: Checks
     ) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """The ends (W, L, C) of 90 % bands by use: of the posterior, or where the model lacks something for that."""
+        """The ends (W, L, C) of 90 % bands by use: of the posterior, or of that with what the model lacks."""
 
         def made(tell: Tell, kept: Kept) -> dict[str, tuple[FloatArray, FloatArray]]:
-            believed, lacking = (posterior, False) if missing is None else (missing.further, True)
+            believed, lacking = (posterior, False) if further is None else (further, True)
             return predictive_bands(self.windows, self.predicted, self.theta, believed, seed, lacking)
 
         return checks.of(Check.BANDS, dict[str, tuple[FloatArray, FloatArray]], made)

@@ -1,4 +1,4 @@
-"""The rows of a linearisation whitened by one noise: products of many columns, formed from the samples.
+"""The rows of a linearisation whitened by one noise: products of many columns, or of many residuals.
 
 ``moments`` sums products once for every channel, gap and window, from which those of any noise follow; the sums grow
 with the square of the columns. Where there are many columns (a probe for each place of each extension) and few noises,
@@ -7,27 +7,10 @@ it is cheaper to whiten the rows for each noise, and to form only the products t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.likelihood import BoundLikelihood, Noise
-
-
-@dataclass(frozen=True)
-class Products:
-    """Sums over the whitened rows of each window, of K of the columns only what the first N ask of them.
-
-    Args:
-        normal: (W, P, P) of the columns [theta (N) | x_w (D) | x_{w-1} (D) | r], P = N + 2 D + 1.
-        cross: (W, P, K) of these with the others.
-        squares: (K,) of the others, each with itself, summed over the windows.
-    """
-
-    normal: FloatArray
-    cross: FloatArray
-    squares: FloatArray
 
 
 class WhitenedRows:
@@ -46,31 +29,46 @@ class WhitenedRows:
 
     def normal(self, residual: FloatArray, noise: Noise) -> FloatArray:
         """Products (W, K', K') of all columns with a residual (W, L, C), as ``Moments.normal`` gives them."""
-        rows = np.concatenate(self._whitened(residual, noise), axis=-1)
+        weight, lag, _ = self._weights(noise)
+        left, before = self._both(residual[..., None])
+        rows = np.concatenate([*self._whitened(noise), weight * left - lag * before], axis=-1)
         return np.swapaxes(rows, 1, 2) @ rows
 
-    def products(self, residual: FloatArray, noise: Noise, first: int) -> Products:
-        """Those of the ``first`` N columns of N + K, the starts' and a residual (W, L, C)."""
-        theta, others = self._whitened(residual, noise)
-        rows, rest = np.concatenate([theta[..., :first], others], axis=-1), theta[..., first:]
-        turned = np.swapaxes(rows, 1, 2)
-        return Products(turned @ rows, turned @ rest, np.einsum("wrk,wrk->k", rest, rest))
+    def scores(self, residuals: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
+        """Products of all columns but the residual's with residuals (W, L, C, S), each by itself.
 
-    def _whitened(self, residual: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
-        """Rows (W, C L, N + K), and (W, C L, 2 D + 1) of [x_w | x_{w-1} | r]; zero where nothing was observed."""
-        n, weights, lags = self.num_theta, [], []
+        Returns:
+            Those of the N + K columns (N + K, S), and those of each window's start (W, D, S).
+        """
+        weight, lag, _ = self._weights(noise)
+        left, before = self._both(residuals)
+        theta, starts = self._whitened(noise)
+        d = starts.shape[-1] // 2
+        white = weight * left - lag * before
+        each = np.swapaxes(starts, 1, 2) @ white
+        force = each[:, :d].copy()
+        force[:-1] += each[1:, d:]
+        return np.einsum("wrk,wrs->ks", theta, white, optimize=True), force
+
+    def _weights(self, noise: Noise) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(W, C L, 1) of each row, of the row before it, and of that inside a window; zero where nothing was seen."""
+        weights, lags = [], []
         for s, sd, tau in zip(self.sequences, noise.sd.tolist(), noise.tau.tolist(), strict=True):
             a = s.coefficients(tau)
             weights.append(1 / (sd * np.sqrt(1 - a**2)))
             lags.append(a * weights[-1])
-        weight, lag = self._placed(weights)[..., None], self._placed(lags)[..., None]
-        inside = np.where(self._crosses[..., None], 0.0, lag)
-        left, before_left = self._both(residual[..., None])
+        lag = self._placed(lags)[..., None]
+        return self._placed(weights)[..., None], lag, np.where(self._crosses[..., None], 0.0, lag)
+
+    def _whitened(self, noise: Noise) -> tuple[FloatArray, FloatArray]:
+        """Rows (W, C L, N + K), and (W, C L, 2 D) of [x_w | x_{w-1}]; zero where nothing was observed."""
+        n = self.num_theta
+        weight, lag, inside = self._weights(noise)
         theta = weight * self._rows[..., :n] - lag * self._before[..., :n]
         own = weight * self._rows[..., n:] - inside * self._before[..., n:]
         # across an edge the row before belongs to the start of the window before
         earlier = (inside - lag) * self._before[..., n:]
-        return theta, np.concatenate([own, earlier, weight * left - lag * before_left], axis=-1)
+        return theta, np.concatenate([own, earlier], axis=-1)
 
     def _both(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Observed rows (W, C L, q) of values (W, L, C, q), and what is in the row before each."""

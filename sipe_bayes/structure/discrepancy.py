@@ -1,0 +1,298 @@
+r"""How far theta may be off, for what the model lacks or may lack: the discrepancy-aware posterior.
+
+In the linear model of ``structure.augmented`` three things are unknown beside theta, each with a prior whose scale is
+integrated by its evidence, so that the interval widens as evidence grows and no alarm decides.
+
+- *What is missing.* Sizes of extensions' probes are single effects, and all of them a little
+  (``structure.single_effects``): what extensions would do spans the discrepancy between machine and model (M. Kennedy,
+  A. O'Hagan, "Bayesian calibration of computer models", 2001, https://doi.org/10.1111/1467-9868.00294).
+- *Numbers that no machine has exactly* (``structure.tolerances``): normal around the model's, of the sd that is stated.
+- *What differs between logs*, or pieces of one that were moved differently. Log g asks for theta_g ~ N(mu, t^2 C_g),
+  C_g what it leaves unknown by itself, with evidence from Cochran's Q of nu degrees of freedom
+
+  .. math:: p(Q \mid t) \propto (1 + t^2)^{-\nu / 2} e^{-Q / (2 (1 + t^2))},
+
+  an integrated Birge ratio (R. Birge, "The calculation of errors by the method of least squares", Physical Review 40
+  (1932), https://doi.org/10.1103/PhysRev.40.207). Theta is that of a further log: a bias that all logs share is at
+  least as large as what differs between them.
+
+Deviations:
+
+- The noise is estimated anew with the effects that are seen, in turns: what a model lacks made it larger and slower.
+- Columns that theta imitates but for ``imitated`` of their information are not asked of the logs: at that level the
+  linearisation of dry friction is no better. With a tolerance they keep it, without one they are left out.
+- How much of what is moved to first order is moved in truth is normal around all of it, of sd ``reach``, and not
+  negative: a linearisation is right to about a half where effects are large.
+- A delay or lag that takes from a parameter what it adds moves theta by the root of its size (``structure.probes``);
+  where all are at work nothing is traded: the root of a small size is not small, and a delay would be wide on any log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.special
+import torch
+
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
+from sipe_bayes.core.options import Options, option
+from sipe_bayes.diagnostics.agreement import LogEstimate, parts_of
+from sipe_bayes.likelihood import UNIFORM_PRECISION
+from sipe_bayes.posterior import GaussianMixture, Particles, Posterior
+from sipe_bayes.structure.augmented import AtNoise, AugmentedModel
+from sipe_bayes.structure.physics_step import PHYSICS_STEP
+from sipe_bayes.structure.probes import Probe
+from sipe_bayes.structure.single_effects import EFFECTS, Columns, Effects, find_effects
+from sipe_bayes.structure.tolerances import EXACT, Tolerances
+
+_NOTHING = 1e-150  # information of a column that moves nothing: its square is no number
+_SAME = 1e-3  # of a column's information: what is left of it beside a number with a tolerance that is the same
+
+
+@dataclass(frozen=True)
+class DiscrepancyOptions(Options):
+    """How the discrepancy is asked, and how many draws are made."""
+
+    imitated: float = option(0.05, "of a column's information, that theta leaves: not asked of the logs", least=0)
+    rounds: int = option(3, "in which effects and noise are estimated in turn", least=1)
+    differ: float = option(0.2, "prior probability that logs ask for different values", least=0)
+    reach: float = option(0.5, "sd of the share of what is moved to first order", least=0)
+    draws: int = option(4000, "of theta: quantiles to one or two percent of an sd", least=1)
+
+
+DISCREPANCY = DiscrepancyOptions()
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """What a model may lack, at its sizes to first order.
+
+    Args:
+        at: the linear model beside the noise that is left.
+        usable: (R,) numbers of the probes whose sizes the logs are asked for.
+        effects: of these; none where there are none.
+        known: the numbers with a tolerance.
+        spread: by how much logs differ.
+        tolerances: of ``known``.
+    """
+
+    at: AtNoise
+    usable: IntArray
+    effects: Effects | None
+    known: Known
+    spread: Spread
+    tolerances: Tolerances = EXACT
+
+    def draw(self, posterior: Posterior, seed: int) -> Particles:
+        """Theta, from a posterior that takes the model for right."""
+        random, logs, made = np.random.default_rng(seed), self.at.logs, self.at.projected
+        count = DISCREPANCY.draws
+        single, every = np.zeros((2, count, len(logs.probes)))
+        if self.effects is not None:
+            single[:, self.usable] = sum(effect.draws(count, random) for effect in self.effects.single)
+            every[:, self.usable] = self.effects.every.draws(count, random)
+        sizes = single + every
+        sizes += self.known.draws(sizes, random)
+        share = np.maximum(1 + DISCREPANCY.reach * random.standard_normal((count, 1)), 0.0)
+        released = made.base - logs.seen.projected.base  # of parameters that come away from their bounds
+        moved = released + share * (logs.traded(single) - sizes @ made.answer.T)
+        return Particles(np.clip(self._stretched(posterior, random) + moved, 0, 1), posterior.space)
+
+    def _stretched(self, posterior: Posterior, random: np.random.Generator) -> FloatArray:
+        """Draws (M, N) of a posterior, stretched by what samples tell less and by what logs differ."""
+        before, after = (np.diag(at.projected.covariance) for at in (self.at.logs.seen, self.at))
+        stretch = np.sqrt(np.where(before > 0, after / np.where(before > 0, before, 1.0), 1.0))
+        generator = torch.Generator().manual_seed(int(random.integers(2**31)))
+        count, normal = (DISCREPANCY.draws,), isinstance(posterior, GaussianMixture)
+        wider = _before_the_cube(posterior, stretch) if isinstance(posterior, GaussianMixture) else posterior
+        theta = wider.sample(count, generator=generator).numpy()
+        if not normal:
+            middle = posterior.mean.numpy()
+            theta = middle + stretch * (theta - middle)
+        apart = self.spread.draws(len(theta), random) * np.sqrt(np.maximum(after, 0.0))
+        return np.asarray(theta + apart * random.standard_normal(theta.shape))
+
+    def contributions(self) -> list[Contribution]:
+        """What each number with a tolerance adds to what is not known of theta."""
+        probes, answer = self.at.logs.probes, self.at.projected.answer
+        sds, out = np.sqrt(np.diag(self.known.covariance)), []
+        for k, sd in zip(self.known.columns.tolist(), sds.tolist(), strict=True):
+            probe, share = probes[k], self.tolerances.of(probes[k])
+            assert probe.extension is not None
+            out.append(Contribution(probe, probe.extension.off(probe.site, share), np.abs(answer[:, k]) * sd))
+        return out
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """Extensions that are more likely at work than not, in words; of what cannot be told apart the likeliest."""
+        if self.effects is None:
+            return ()
+        seen = [effect for effect in self.effects.single if effect.present > 0.5]
+        names = [self.at.logs.probes[self.usable[int(effect.by_column.argmax())]].name for effect in seen]
+        return tuple(dict.fromkeys(names))
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """What a number with a tolerance adds.
+
+    Args:
+        probe: that changes it.
+        sentence: what the model has wrong where it is off by its tolerance.
+        shift: (N,) sds of theta.
+    """
+
+    probe: Probe
+    sentence: str
+    shift: FloatArray
+
+
+def draw_differing(posterior: Posterior, logs: Sequence[LogEstimate], seed: int) -> Particles:
+    """Theta of a further log, from a posterior and what several logs say by themselves, where nothing is probed."""
+    middle, random = posterior.mean.numpy(), np.random.default_rng(seed)
+    scores = [log.information @ (log.mean - middle) for log in logs]
+    apart = Spread.between([log.information for log in logs], scores).draws(DISCREPANCY.draws, random)
+    generator = torch.Generator().manual_seed(int(random.integers(2**31)))
+    theta = posterior.sample((len(apart),), generator=generator).numpy()
+    theta = theta + apart * posterior.stddev.numpy() * random.standard_normal(theta.shape)
+    return Particles(np.clip(theta, 0, 1), posterior.space)
+
+
+def find_discrepancy(logs: AugmentedModel, tolerances: Tolerances = EXACT) -> Discrepancy:
+    """What the model lacks, or may lack; no simulation beside what ``logs`` took.
+
+    Args:
+        logs: the linear model at an estimate.
+        tolerances: of numbers that no machine has exactly.
+    """
+    at, sds = logs.seen, np.array([tolerances.of(probe) * probe.whole for probe in logs.probes])
+    sds = np.where(np.isfinite(sds), sds, 0.0)
+    for _ in range(DISCREPANCY.rounds):
+        before, told = at.sizes, at.discounted
+        usable, effects = _effects(told, sds)
+        sizes = np.zeros(len(logs.probes))
+        if effects is not None:
+            sizes[usable] = effects.sizes
+        if not (sizes.any() or before.any()):
+            break
+        at = AtNoise(logs, logs.estimate_noise(at.noise, sizes), sizes)
+    told = AtNoise(logs, told.noise, sizes)
+    return Discrepancy(told, usable, effects, Known.of(told, sds), Spread.of(told), tolerances)
+
+
+def asked(at: AtNoise) -> BoolArray:
+    """Whether the logs are asked for the size of each probe (K,): theta does not imitate almost all of it."""
+    made = at.projected
+    return (made.whole > _NOTHING) & (np.diag(made.information) > DISCREPANCY.imitated * made.whole)
+
+
+def _effects(at: AtNoise, sds: FloatArray) -> tuple[IntArray, Effects | None]:
+    """The probes that may be missing, and what is told of them beside numbers of known sds (K,)."""
+    probes, made = at.logs.probes, at.projected
+    able = [not probe.by_log and probe.extension is not PHYSICS_STEP for probe in probes]
+    usable = np.flatnonzero(asked(at) & np.array(able, bool))
+    known = Known.of(at, sds)
+    information, score = known.without(made.information, made.score)
+    usable = usable[np.diag(information)[usable] > _SAME * np.diag(made.information)[usable]]
+    if not len(usable):
+        return usable, None
+    names, one_sided = [probes[k].name for k in usable], at.logs.one_sided[usable]
+    return usable, find_effects(Columns(names, information[np.ix_(usable, usable)], score[usable], one_sided))
+
+
+@dataclass(frozen=True)
+class Known:
+    """Numbers with a tolerance: their sizes are normal around zero, and told by the logs where theta leaves that.
+
+    Args:
+        columns: (J,) numbers of the probes.
+        cross: (J, K) information of theirs with all probes, zero where the logs are not asked.
+        covariance: (J, J) of their sizes.
+        mean: (J,) beside no other probe.
+    """
+
+    columns: IntArray
+    cross: FloatArray
+    covariance: FloatArray
+    mean: FloatArray
+
+    @classmethod
+    def of(cls, at: AtNoise, sds: FloatArray) -> Known:
+        """With sds (K,) in sizes, zero of what has no tolerance."""
+        columns, made = np.flatnonzero(sds), at.projected
+        told = asked(at)[columns]
+        cross = np.where(told[:, None], made.information[columns], 0.0)
+        own = np.where(np.outer(told, told), cross[:, columns], 0.0)
+        covariance = np.linalg.inv(own + np.diag(1 / sds[columns] ** 2))
+        return cls(columns, cross, covariance, covariance @ np.where(told, made.score[columns], 0.0))
+
+    def without(self, information: FloatArray, score: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Information (K, K) and score (K,) of all probes with these integrated out."""
+        return information - self.cross.T @ self.covariance @ self.cross, score - self.cross.T @ self.mean
+
+    def draws(self, sizes: FloatArray, random: np.random.Generator) -> FloatArray:
+        """(M, K) of them alone, beside sizes (M, K) of others."""
+        out, variances = np.zeros_like(sizes), np.diag(np.diag(self.covariance))
+        root = np.linalg.cholesky(self.covariance + 1e-12 * variances)
+        away = random.standard_normal((len(sizes), len(self.columns))) @ root.T
+        out[:, self.columns] = self.mean - sizes @ (self.covariance @ self.cross).T + away
+        return out
+
+
+@dataclass(frozen=True)
+class Spread:
+    """By how much logs differ.
+
+    Args:
+        times: (T,) how many times what a log leaves unknown by itself.
+        weights: (T,) their probabilities.
+        alone: (N,) how many times its variance of all logs is that of a log by itself.
+    """
+
+    times: FloatArray
+    weights: FloatArray
+    alone: FloatArray
+
+    @classmethod
+    def of(cls, at: AtNoise) -> Spread:
+        """Of logs, or of pieces of one, in the linear model."""
+        n, among = at.logs.windows.num_theta, np.ix_(at.free, at.free)
+        parts = [at.of_part(mine) for _, mine in parts_of(at.logs.windows)]
+        scores = [(gradient[:n] - precision[:n, n:] @ at.sizes)[at.free] for precision, gradient in parts]
+        own = cls.between([precision[:n, :n][among] for precision, _ in parts], scores)
+        alone = np.zeros(n)
+        alone[at.free] = own.alone
+        return replace(own, alone=alone)
+
+    @classmethod
+    def between(cls, precisions: Sequence[FloatArray], scores: Sequence[FloatArray]) -> Spread:
+        """Of G logs with (N, N) and (N,) at a common theta each; none of a single one."""
+        n = len(scores[0]) if scores else 0
+        if len(scores) < 2 or not n:
+            return cls(np.zeros(1), np.ones(1), np.zeros(n))
+        belief = UNIFORM_PRECISION * np.eye(n)
+        own, whole = [np.linalg.inv(one + belief) for one in precisions], np.linalg.inv(sum(precisions) + belief)
+        pull = np.sum(scores, axis=0)
+        square = sum(float(s @ c @ s) for s, c in zip(scores, own, strict=True)) - float(pull @ whole @ pull)
+        left = UNIFORM_PRECISION * (sum(np.trace(c) for c in own) - np.trace(whole))
+        freedom = max((len(scores) - 1) * n - left, 0.0)
+        grid, believed = EFFECTS.grid
+        times = np.append(0.0, grid)
+        prior = np.log(np.append(1 - DISCREPANCY.differ, DISCREPANCY.differ * believed))
+        evidence = prior - 0.5 * freedom * np.log1p(times**2) - 0.5 * max(square, 0.0) / (1 + times**2)
+        alone = np.mean([np.diag(c) for c in own], axis=0) / np.diag(whole)
+        return cls(times, scipy.special.softmax(evidence), np.minimum(alone, 2 * len(scores)))
+
+    def draws(self, count: int, random: np.random.Generator) -> FloatArray:
+        """(M, N): sds that are added, in those that all logs leave."""
+        times = random.choice(self.times, count, p=self.weights)
+        return np.asarray(times[:, None] * np.sqrt(1 + self.alone))
+
+
+def _before_the_cube(posterior: GaussianMixture, stretch: FloatArray) -> GaussianMixture:
+    """Stretched where the cube does not cut it off yet, each component as probable as before."""
+    covariances = posterior.covariances.numpy() * np.outer(stretch, stretch)
+    log_weights = posterior.log_weights + posterior.log_masses
+    return GaussianMixture(log_weights, posterior.means, covariances, posterior.space).of_masses()

@@ -1,0 +1,218 @@
+r"""Which few of many columns are at work, and how surely: a sum of single effects, and all of them, each a little.
+
+The coefficients of K correlated columns, of which nobody knows which are at work, are a sum of effects, each of one
+column at most (SuSiE: G. Wang, A. Sarkar, P. Carbonetto, M. Stephens, "A simple new approach to variable selection in
+regression", Journal of the Royal Statistical Society B 82 (2020), 1273-1300, https://doi.org/10.1111/rssb.12388). An
+effect's posterior says with what probability it is which column, so that columns that no log can tell apart stand
+together with about the same probability, and none is chosen. Beside them all columns may be at work, each a little, for
+what none of them is (SuSiE-inf: R. Cui et al., "Improving fine-mapping by modeling infinitesimal effects", Nature
+Genetics 56 (2024), 162-169, https://doi.org/10.1038/s41588-023-01597-3).
+
+With S the information of the columns and q their score, an effect of column k has b_k ~ N(0, t^2 / S_kk), halved where
+its size may not be negative; all columns have N(0, t^2 / (c_k S_kk)), c_k the number of extensions times that of the
+columns that belong to k's. In both t^2 is about what is added to chi-square; t is half-Cauchy (A. Gelman, "Prior
+distributions for variance parameters in hierarchical models", 2006, https://doi.org/10.1214/06-BA117A), on a grid:
+
+.. math::
+
+    p(q \mid t, k) &\propto (1 + t^2)^{-1/2} e^{z^2 t^2 / (2 (1 + t^2))} [2 \Phi(z t / \sqrt{1 + t^2})],
+    \qquad z = q_k / \sqrt{S_{kk}}, \\
+    p(q \mid t) &\propto |I + D S D|^{-1/2} e^{q' D (I + D S D)^{-1} D q / 2}, \qquad
+    D = \operatorname{diag}(t / \sqrt{c_k S_{kk}}).
+
+Deviations:
+
+- The size of an effect is integrated over a grid, not estimated, and each effect may be none.
+- Effects are added one at a time, while the last one is more likely there than not; that last one is kept, for what is
+  too small to be seen.
+- All columns at work are asked of what the single effects leave, after them; their sizes have either sign.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.special
+
+from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.options import Options, option
+from sipe_bayes.posterior.truncated_normal import interval_quantile
+
+_FAR = 40.0  # sds beyond which a normal has no mass
+_SETTLED = 1e-3  # sds of a column, by which no effect changes any more
+
+
+@dataclass(frozen=True)
+class EffectOptions(Options):
+    """What is believed of effects beforehand."""
+
+    absent: float = option(0.75, "prior probability that an effect is none; that not all are at work", least=0)
+    scale: float = option(3.0, "of the half-Cauchy on the root of what it adds to chi-square", "sds", above=0)
+    smallest: float = option(0.3, "of the grid of that root", "sds", above=0)
+    largest: float = option(3000.0, "of the grid of that root", "sds", above=0)
+    sizes: int = option(25, "between these two, evenly in their logarithm", least=2)
+    effects: int = option(5, "single ones at most: a dozen small ones together explain anything", least=1)
+    rounds: int = option(30, "over all effects at most, until they settle", least=1)
+
+    @property
+    def grid(self) -> tuple[FloatArray, FloatArray]:
+        """The sizes t (T,) and their prior probabilities."""
+        t = np.geomspace(self.smallest, self.largest, self.sizes)
+        density = t / (1 + (t / self.scale) ** 2)  # by logarithm
+        return t, density / density.sum()
+
+
+EFFECTS = EffectOptions()
+
+
+@dataclass(frozen=True)
+class Columns:
+    """K columns, all else projected out.
+
+    Args:
+        names: (K,) of the extensions that they belong to.
+        information: (K, K).
+        score: (K,).
+        one_sided: (K,) those whose size may not be negative.
+    """
+
+    names: Sequence[str]
+    information: FloatArray
+    score: FloatArray
+    one_sided: BoolArray
+
+    @property
+    def parts(self) -> FloatArray:
+        """Each column's share (K,) of its extension's, where all extensions have the same; they add up to one."""
+        count = Counter(self.names)
+        return np.array([1 / (len(count) * count[name]) for name in self.names])
+
+
+@dataclass(frozen=True)
+class SingleEffect:
+    """One column at work, of any size, or none.
+
+    Args:
+        weights: (T, K) probabilities of size and column.
+        mean: (T, K) and
+        sd: (T, 1) of the normal of the column's z, before it is cut off.
+        columns: that it is one of.
+    """
+
+    weights: FloatArray
+    mean: FloatArray
+    sd: FloatArray
+    columns: Columns
+
+    @classmethod
+    def of(cls, columns: Columns, score: FloatArray, options: EffectOptions) -> SingleEffect:
+        """By what other effects leave of the score (K,)."""
+        t, believed = options.grid
+        z, shrunk = score / np.sqrt(np.diag(columns.information)), (t**2 / (1 + t**2))[:, None]
+        evidence = -0.5 * np.log1p(t**2)[:, None] + 0.5 * shrunk * z**2
+        half = np.log(2) + scipy.special.log_ndtr(np.sqrt(shrunk) * z)
+        evidence = evidence + np.where(columns.one_sided, half, 0.0) + np.log(believed)[:, None]
+        evidence = evidence + np.log(columns.parts) + np.log1p(-options.absent)
+        total = np.logaddexp(np.log(options.absent), scipy.special.logsumexp(evidence))
+        return cls(np.exp(evidence - total), shrunk * z, np.sqrt(shrunk), columns)
+
+    @property
+    def present(self) -> float:
+        """The probability that it is not none."""
+        return float(self.weights.sum())
+
+    @property
+    def by_column(self) -> FloatArray:
+        """(K,) that it is which."""
+        return np.asarray(self.weights.sum(0))
+
+    @property
+    def sizes(self) -> FloatArray:
+        """(K,) means."""
+        cut = -self.mean / self.sd
+        tail = np.exp(-0.5 * cut**2 - 0.5 * np.log(2 * np.pi) - scipy.special.log_ndtr(-cut))
+        mean = np.where(self.columns.one_sided, self.mean + self.sd * tail, self.mean)
+        return np.asarray((self.weights * mean).sum(0) / np.sqrt(np.diag(self.columns.information)))
+
+    def draws(self, count: int, random: np.random.Generator) -> FloatArray:
+        """Of the sizes (count, K)."""
+        grid, k = self.weights.shape
+        flat = np.append(self.weights.ravel(), max(1 - self.present, 0.0))
+        chosen = random.choice(len(flat), count, p=flat / flat.sum())
+        there = np.flatnonzero(chosen < grid * k)
+        t, column = np.divmod(chosen[there], k)
+        mean, sd = self.mean[t, column], self.sd[t, 0]
+        low = np.where(self.columns.one_sided[column], -mean / sd, -_FAR)
+        own = mean + sd * interval_quantile(low, np.maximum(low, 0.0) + _FAR, random.uniform(size=len(there)))
+        sizes = np.zeros((count, k))
+        sizes[there, column] = own / np.sqrt(np.diag(self.columns.information)[column])
+        return sizes
+
+
+class AllEffects:
+    """All columns at once, each a little, or none."""
+
+    def __init__(self, columns: Columns, score: FloatArray, options: EffectOptions) -> None:
+        self.t, believed = options.grid
+        self.scale = np.sqrt(columns.parts / np.diag(columns.information))
+        values, self.axes = np.linalg.eigh(columns.information * np.outer(self.scale, self.scale))
+        self.values, self.along = np.maximum(values, 0.0), self.axes.T @ (self.scale * score)
+        square = self.t[:, None] ** 2
+        grown = square / (1 + square * self.values)
+        evidence = 0.5 * (grown * self.along**2 - np.log1p(square * self.values)).sum(1) + np.log(believed)
+        evidence = evidence + np.log1p(-options.absent)
+        total = np.logaddexp(np.log(options.absent), scipy.special.logsumexp(evidence))
+        self.weights = np.exp(evidence - total)
+
+    def draws(self, count: int, random: np.random.Generator) -> FloatArray:
+        """Of the sizes (count, K)."""
+        weights = np.append(self.weights, max(1 - self.weights.sum(), 0.0))
+        square = random.choice(np.append(self.t, 0.0), count, p=weights / weights.sum())[:, None] ** 2
+        variance = square / (1 + square * self.values)
+        along = variance * self.along + np.sqrt(variance) * random.standard_normal((count, len(self.values)))
+        return np.asarray(along @ self.axes.T * self.scale)
+
+
+@dataclass(frozen=True)
+class Effects:
+    """What is at work: single effects, the strongest first, and all columns a little."""
+
+    single: tuple[SingleEffect, ...]
+    every: AllEffects
+
+    @property
+    def sizes(self) -> FloatArray:
+        """(K,) means of what single effects are more likely there than not."""
+        seen = [effect.sizes for effect in self.single if effect.present > 0.5]
+        return np.sum(seen, axis=0) if seen else np.zeros(len(self.every.scale))
+
+
+def find_effects(columns: Columns, options: EffectOptions = EFFECTS) -> Effects:
+    """The effects' posterior, by coordinate ascent: each is fitted to what the others leave (Wang et al., section 3.2).
+
+    Args:
+        columns: K of them, with information each.
+        options: of the prior.
+    """
+    effects: list[SingleEffect] = []
+    sd = np.sqrt(np.diag(columns.information))
+    sizes = np.zeros((options.effects, len(columns.score)))
+    while len(effects) < options.effects and (not effects or effects[-1].present > 0.5):
+        effects.append(SingleEffect.of(columns, columns.score - columns.information @ sizes.sum(0), options))
+        sizes[len(effects) - 1] = effects[-1].sizes
+        for _ in range(options.rounds):
+            before = sizes.copy()
+            for k in range(len(effects)):
+                rest = sizes.sum(0) - sizes[k]
+                effects[k] = SingleEffect.of(columns, columns.score - columns.information @ rest, options)
+                sizes[k] = effects[k].sizes
+            if (np.abs(sizes - before) * sd).max() < _SETTLED:
+                break
+        if sum(effect.present <= 0.5 for effect in effects) > 1:  # the new one shares what another has
+            effects.pop()
+            sizes[len(effects)] = 0.0
+    left = columns.score - columns.information @ sizes.sum(0)
+    return Effects(tuple(sorted(effects, key=lambda e: -e.present)), AllEffects(columns, left, options))

@@ -1,0 +1,52 @@
+"""Numbers that no machine has exactly, and that often no motion tells: forces, drawings, clocks.
+
+A machine whose motors give a tenth more than the log says, with masses, inertias and friction a tenth larger, moves
+alike; and so does one with a lighter link whose centre of mass lies further out. Joints that are read one after the
+other at one time stamp look like servos that are softer from one to the next. Theta's answer to a number that is off by
+its tolerance is then what values are unknown by beside all that the logs tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from sipe_bayes.structure.physics_step import PHYSICS_STEP
+from sipe_bayes.structure.probes import Probe
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Sds of numbers that no machine has exactly; by default all are exact.
+
+    Args:
+        commands: of what each actuator delivers, as a share of what its command says.
+        geometry: of where a body's centre of mass lies, as a share of its ``reach`` (``structure.machine``), and of a
+            mass that is not unknown, as a share of it.
+        timing: of when a measurement was taken, as a share of the time from sample to sample.
+        physics_step: of what physics steps change, as a share of all that they do: a machine takes none.
+    """
+
+    commands: Mapping[str, float] = field(default_factory=dict)
+    geometry: float = 0.0
+    timing: float = 0.0
+    physics_step: float = 0.0
+
+    def of(self, probe: Probe) -> float:
+        """The sd of the number that a probe changes."""
+        if probe.extension is None:
+            return 0.0
+        if probe.extension is PHYSICS_STEP:
+            return self.physics_step
+        shares = {"body": self.geometry, "channel": self.timing, "actuator": self.commands.get(probe.site, 0.0)}
+        return shares.get(probe.extension.kind, 0.0)
+
+
+EXACT = Tolerances()
+COMMANDS, GEOMETRY, TIMING = 0.1, 0.05, 0.1  # the usual sds: of motor constants, of drawings, of loops that read joints
+PHYSICS_STEPS = 1.0  # between a machine without any and a simulated log in the model's own
+
+
+def usual(actuators: Sequence[str]) -> Tolerances:
+    """Those of machines of which nobody has said more."""
+    return Tolerances(dict.fromkeys(actuators, COMMANDS), GEOMETRY, TIMING, PHYSICS_STEPS)
