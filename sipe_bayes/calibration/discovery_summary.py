@@ -41,6 +41,7 @@ from sipe_bayes.structure.comparison import difference, rank
 from sipe_bayes.structure.discrepancy import Discrepancy, find_discrepancy
 from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.fitted import FittedStructure
+from sipe_bayes.structure.probes import place_extensions
 from sipe_bayes.structure.state import Phase
 from sipe_bayes.structure.structures import Structures
 
@@ -191,9 +192,10 @@ class _Model:
         windows = fitting.windows(self.structures.simulator(one))
         prior = QuadraticPrior.of(fitting.prior_of(windows.simulator))
         try:
-            logs = AugmentedModel(
-                windows, one.theta, one.noise, one.starts, prior, tell=self.tell, extensions=self.extensions
-            )
+            asked = self.extensions
+            placed = None if asked is None else place_extensions(windows, one.theta, one.starts, asked)
+            at = one.theta, one.noise, one.starts, prior
+            logs = AugmentedModel(windows, *at, tell=self.tell, placed=placed, shorter=asked is None)
             return find_discrepancy(logs, self.problem.tolerances)
         except ValueError:  # LinAlgError is one
             return None

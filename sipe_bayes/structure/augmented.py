@@ -32,12 +32,13 @@ from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood import BoundLikelihood, Eliminated, Linearisation, Noise, QuadraticPrior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
-from sipe_bayes.structure.extension import Extension, Placed
+from sipe_bayes.structure.extension import Placed
 from sipe_bayes.structure.probes import place_extensions, probes, probes_cost
 from sipe_bayes.structure.whitened_rows import WhitenedRows
 
 FLAT_PRECISION = 1e-6  # keeps information invertible where a direction is open
 _SHORT = 50  # samples, of which no memory is asked
+_FAINT = 1e-6  # of a probe's information, of its prior: what theta and the starts imitate to within that has no size
 _PRESSED = 1e-6  # of the range: a parameter that the search left on its bound
 
 
@@ -82,10 +83,20 @@ class Projected:
     base: FloatArray
 
 
+@dataclass(frozen=True)
+class Fitted:
+    """Some probes at their best: log-likelihood in nats, and sizes (J,)."""
+
+    level: float
+    sizes: FloatArray
+
+
 class AugmentedModel:
     """The logs linearised at the estimate, with K probes beside the N parameters.
 
     Costs a linearisation and a rollout for each probe. Of long or many logs some windows are looked at, spread evenly.
+
+    ``share`` is how many times as many windows there are as are looked at.
 
     Args:
         windows: the logs, W windows of C channels.
@@ -96,7 +107,8 @@ class AugmentedModel:
         lin: at theta and starts, where it is known.
         tell: called with what is being done.
         kept: keeps what extensions do.
-        extensions: that are probed; default all that the registry has.
+        placed: extensions that are probed; default all that the registry has.
+        shorter: whether a shorter physics step is asked as well.
 
     Raises:
         ValueError: where the simulation diverges at theta.
@@ -112,10 +124,13 @@ class AugmentedModel:
         lin: Linearisation | None = None,
         tell: Tell = silent,
         kept: Kept = NOTHING_KEPT,
-        extensions: Sequence[Extension] | None = None,
+        placed: Sequence[Placed] | None = None,
+        shorter: bool = True,
     ) -> None:
-        placed = place_extensions(windows, theta, windows.no_starts() if starts is None else starts, extensions)
+        if placed is None:
+            placed = place_extensions(windows, theta, windows.no_starts() if starts is None else starts)
         some = windows.spread_over(steps_of(windows, placed))
+        self.share = windows.num_windows / len(some)
         if len(some) < windows.num_windows:
             windows, starts = windows.part(some), None if starts is None else starts[some]
             lin = None if lin is None else lin.part(some)
@@ -125,9 +140,10 @@ class AugmentedModel:
         linearisation = lin or windows.linearise(theta, starts)
         if not linearisation.valid:
             raise ValueError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
-        self.probes, effects, self.one_sided = probes(windows, theta, starts, placed, extensions is None, tell, kept)
+        made = probes(windows, theta, starts, placed, shorter, tell, kept)
+        self.probes, self.one_sided, self.effects = made.named, made.one_sided, made.effects
         n = windows.num_theta
-        parts = (linearisation.jacobian[..., :n], effects, linearisation.jacobian[..., n:])
+        parts = (linearisation.jacobian[..., :n], made.change, linearisation.jacobian[..., n:])
         self.residual, self.jacobian = linearisation.residual, np.concatenate(parts, axis=-1)
         self.count, self.coloured = n + len(self.probes), bool((noise.tau > 0).any())
         self.inner, self.pull = prior.precision + FLAT_PRECISION * np.eye(n), prior.pull(theta)
@@ -148,6 +164,24 @@ class AugmentedModel:
         pulls = windows.pulls(self.inner, self.pull, self.starts, AtNoise(self, before, sizes).free)
         noise = windows.estimate_noise(windows.moments(lin), before, pulls, self.coloured)
         return Noise(np.maximum(noise.sd, windows.rounding), noise.tau)
+
+    def fitted(self, columns: IntArray) -> Fitted:
+        """The log-likelihood with some probes (J,) of any size, at the noise that is best with them."""
+        n, windows = self.windows.num_theta, self.windows
+        every = np.concatenate([np.arange(n), n + columns, np.arange(self.count, self.jacobian.shape[-1])])
+        moments = windows.moments(Linearisation(self.residual, self.jacobian[..., every], True))
+        normal, count = moments.normal(self.noise), n + len(columns)
+        precision, pull = np.zeros((count, count)), np.zeros(count)
+        precision[:n, :n], pull[:n] = self.inner, self.pull
+        # probes of no size of their own, so that the information exists
+        precision[n:, n:] = _FAINT * np.diag(np.diag(normal.sum(0))[n:count])
+        noise = windows.estimate_noise(moments, self.noise, windows.pulls(precision, pull, self.starts), True)
+        normal = moments.normal(noise)
+        arrow = windows.eliminate(normal, count, self.starts)
+        total = arrow.gradient + pull
+        step = np.linalg.solve(arrow.precision + precision, total)
+        square = float(normal[:, -1, -1].sum()) - arrow.explained - float(total @ step)
+        return Fitted(-0.5 * (moments.log_determinant(noise) + square), np.asarray(step[n:], float))
 
     def traded(self, sizes: FloatArray) -> FloatArray:
         """By how much sizes (..., K) of the probes change theta itself (..., N), which they trade."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -19,10 +18,8 @@ from sipe_bayes.likelihood import BoundLikelihood, FitResult, Noise, QuadraticPr
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.candidates import promised
 from sipe_bayes.structure.columns import Column, corrected
 from sipe_bayes.structure.extension import Placed, extended
-from sipe_bayes.structure.physics_step import step_change
 from sipe_bayes.structure.scores import Pieces, predictive, scores
 
 # structures differ by nats, and where friction has kinks the last ones come in ever smaller steps
@@ -171,16 +168,6 @@ class Fitting:
         """Rollouts that the scores of an optimum take."""
         held = 0 if self.holdout is None else 2 * len(self.holdout)
         return (windows.num_theta + windows.num_start + 1) * (len(self.trajectories) + held)
-
-    def step_gain(self, placed: Sequence[Placed], finer: Sequence[Placed], one: FittedStructure) -> tuple[float, int]:
-        """Nats that a fitted structure promises in shorter physics steps, infinite if those diverge; and rollouts."""
-        simulator = self.simulator(placed)
-        windows, shorter = self.windows(simulator), self.windows(self.simulator(finer))
-        change, gain = step_change(windows, shorter, one.theta, one.starts), math.inf
-        if change is not None:
-            prior = QuadraticPrior.of(self.prior_of(simulator))
-            gain = promised(windows, one.theta, one.starts, one.noise, prior, change)
-        return gain, windows.rollouts + shorter.rollouts
 
     def _optimum(
         self,

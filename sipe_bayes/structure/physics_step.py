@@ -125,23 +125,6 @@ def shorter_steps(windows: BoundLikelihood) -> list[Placed]:
     return pieces
 
 
-def step_change(
-    windows: BoundLikelihood, finer: BoundLikelihood, theta: FloatArray, starts: FloatArray
-) -> FloatArray | None:
-    """What shorter steps change of the predictions (W, L, C), None where a run diverges; by a rollout of each.
-
-    Args:
-        windows: in the steps of an estimate.
-        finer: the same logs in shorter ones.
-        theta: (N,), the estimate.
-        starts: (W, D), there.
-    """
-    begun = mapped_starts(windows.simulator.model, finer.simulator.model, starts)
-    (plain,), own = windows.residuals(theta[None], starts[None])
-    (short,), other = finer.residuals(theta[None], begun[None])
-    return plain - short if own[0] and other[0] else None
-
-
 def step_error(windows: BoundLikelihood, theta: FloatArray, starts: FloatArray) -> StepError | None:
     """The error at theta (N,) and starts (W, D), by at most ``RUNS`` rollouts.
 

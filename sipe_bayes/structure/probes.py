@@ -81,6 +81,23 @@ class Probe:
 
 
 @dataclass(frozen=True)
+class Probes:
+    """Causes that a model may lack, K of which change what is observed.
+
+    Args:
+        named: the K.
+        change: (W, L, C, K) of the predictions, of a root-mean-square of one.
+        one_sided: (K,) whether the size of each may not be negative.
+        effects: of extensions, whose probes stand first in this order.
+    """
+
+    named: list[Probe]
+    change: FloatArray
+    one_sided: BoolArray
+    effects: list[Effect]
+
+
+@dataclass(frozen=True)
 class _Change:
     """An ``Effect`` without what it is of: the number of that in its group."""
 
@@ -106,7 +123,7 @@ def probes(
     shorter: bool = True,
     tell: Tell = silent,
     kept: Kept = NOTHING_KEPT,
-) -> tuple[list[Probe], FloatArray, BoolArray]:
+) -> Probes:
     """Probes of extensions, and of a shorter physics step; none where the environment is no user's MJCF.
 
     Args:
@@ -117,13 +134,9 @@ def probes(
         shorter: whether a shorter physics step is asked as well.
         tell: called with what is being done.
         kept: keeps what extensions do, group by group.
-
-    Returns:
-        The K probes that change what is observed; their effects (W, L, C, K) on the predictions; and whether the size
-        of each (K,) may not be negative.
     """
     if not isinstance(windows.simulator.environment, MjcfEnvironment):
-        return [], np.zeros((*windows.observed.shape, 0)), np.zeros(0, bool)
+        return Probes([], np.zeros((*windows.observed.shape, 0)), np.zeros(0, bool), [])
     seen = effects(windows, theta, starts, placed, tell, kept)
     named = [probe for effect in seen for probe in _named(effect)]
     one_sided = [bounds(effect.placed.plain, effect.probes)[0] >= 0 for effect in seen]
@@ -134,7 +147,7 @@ def probes(
         named.append(Probe(PHYSICS_STEP.sentence(WORLD), error.remedy, False, WORLD, PHYSICS_STEP, whole))
         changes.append(_unit(change))
         one_sided.append(np.ones(1, bool))
-    return named, np.concatenate(changes, axis=-1), np.concatenate([np.zeros(0, bool), *one_sided])
+    return Probes(named, np.concatenate(changes, axis=-1), np.concatenate([np.zeros(0, bool), *one_sided]), seen)
 
 
 def _step_error(

@@ -26,14 +26,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.budget import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.inference.recorded import Progress
-from sipe_bayes.likelihood import QuadraticPrior
-from sipe_bayes.structure.candidates import Candidate, candidates
+from sipe_bayes.likelihood import BoundLikelihood, QuadraticPrior
+from sipe_bayes.structure.augmented import AugmentedModel
+from sipe_bayes.structure.candidates import Candidate, gain_of_steps, rank_candidates
 from sipe_bayes.structure.columns import Column, channels_of, choices, is_explained, log_jacobian, moving, unexplained
 from sipe_bayes.structure.comparison import choose_ties, difference, rank
 from sipe_bayes.structure.extension import Extension, Placed, members, placements
@@ -252,21 +254,25 @@ class StructureSearch:
         taken = {*here.labels, *(t for p in own for q in p.parameters for t in q.targets)}
         rest = [p for p in self._placed.values() if p.extension.last_resort == last_resort and p.parameters]
         rest = [p for p in rest if not taken & {p.label, *(t for q in p.parameters for t in q.targets)}]
-        windows.budget, ranked, cut = self._left(state), list[Candidate](), None
+        windows.budget, ranked, cut, gain = self._left(state), list[Candidate](), None, 0.0
+        finer = None if last_resort else self._ladder.finer(here.labels)
         try:
-            if rest:
-                at = here.theta, here.starts, here.noise, prior
-                ranked = candidates(windows, *at, rest, lambda what: self._tell(what, windows.rollouts))
+            if rest or finer is not None:
+                at, tell = (here.theta, here.noise, here.starts, prior), partial(self._simulating, windows)
+                logs = AugmentedModel(windows, *at, tell=tell, placed=rest, shorter=finer is not None)
+                ranked = rank_candidates(logs)
+                gain = 0.0 if finer is None else gain_of_steps(logs)
         except BudgetExhausted:
             cut = state.phase
         offers = tuple(Offer(here.labels, c.placed.label, c.gain, c.theta, c.others) for c in ranked)
         ranks = state.rank_rollouts + windows.rollouts
-        finer = None if last_resort or cut is not None else self._ladder.finer(here.labels)
-        if finer is not None:
-            gain, rollouts = fitting.step_gain(own, self.structure(finer), here)
-            offers, ranks = (*offers, Offer(here.labels, finer[-1], gain, np.zeros(0), here.theta)), ranks + rollouts
+        if finer is not None and gain > 0:
+            offers = (*offers, Offer(here.labels, finer[-1], gain, np.zeros(0), here.theta))
         done = (*state.ranked, here.labels) if cut is None and not last_resort else state.ranked
         return replace(state, offers=state.offers + offers, ranked=done, rank_rollouts=ranks, cut=cut), ranked
+
+    def _simulating(self, windows: BoundLikelihood, what: str) -> None:
+        self._tell(what, windows.rollouts)
 
     def _left(self, state: DiscoverState) -> int:
         """Rollouts of the budget."""
