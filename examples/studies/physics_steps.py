@@ -25,6 +25,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from late_sensors import MACHINES, MODELS, Machine
+from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
+from sipe_bayes.diagnostics.misfit.misspecification import misfit
+from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
+from sipe_bayes.diagnostics.misfit.tolerances import Tolerances
 
 import sipe_bayes as sipe
 from sipe_bayes.benchmark.measurement import source
@@ -32,10 +36,6 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import write_text
 from sipe_bayes.core.findings import Severity
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
-from sipe_bayes.diagnostics.misfit.misspecification import misfit
-from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
-from sipe_bayes.diagnostics.misfit.tolerances import Tolerances
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace import Laplace

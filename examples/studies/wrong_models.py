@@ -35,6 +35,10 @@ import numpy as np
 import torch
 from _kept import fits, keep
 from discover import DT, MACHINES, commands, plain, values
+from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
+from sipe_bayes.diagnostics.misfit.misspecification import misfit
+from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
+from sipe_bayes.inference.random_effects import random_effects
 
 import sipe_bayes as sipe
 from sipe_bayes.core.arrays import FloatArray
@@ -42,12 +46,8 @@ from sipe_bayes.core.files import write_text
 from sipe_bayes.core.findings import Severity
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.agreement import disagreement, linear_estimates, parts_of
-from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
-from sipe_bayes.diagnostics.misfit.misspecification import misfit
-from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace import Laplace
-from sipe_bayes.inference.random_effects import random_effects
 from sipe_bayes.likelihood import BoundLikelihood, Noise, QuadraticPrior, Segments, bind
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.structure.extension import Placed, extended, members, placements

@@ -76,11 +76,11 @@ def misfit(
     p = float((1 + (largest >= odd.max()).sum()) * floor)
     effect = None if found.effects is None else found.effects.single[0]
     count, says = len(seen.logs.probes), _Says(found, sd, p)
-    if effect is not None and (effect.present > 0.5 or worst < count):
+    if effect is not None and effect.present > 0.5:
         named = replace(says.of_effect(effect), floor=floor)
         if worst < count or max(named.share.values()) >= THRESHOLDS.small_misfit:
             return named
-    return replace(says.of_colour(max(worst - count, 0)), floor=floor)
+    return replace(says.of_probe(worst) if worst < count else says.of_colour(worst - count), floor=floor)
 
 
 def drawn(at: AtNoise, random: np.random.Generator, simulated: int) -> FloatArray:
@@ -179,17 +179,27 @@ class _Says:
         self.sd = np.sqrt(np.diag(self.seen.projected.covariance)) if sd is None else sd
 
     def of_effect(self, effect: SingleEffect) -> Misfit:
-        """That an effect is at work, beside the noise that the others leave."""
-        logs, at, usable = self.found.at.logs, self.found.at, self.found.usable
-        sizes = np.zeros(len(logs.probes))
+        """That an effect is at work, beside the noise that all of them leave."""
+        probes, usable = self.found.at.logs.probes, self.found.usable
+        sizes = np.zeros(len(probes))
         sizes[usable] = effect.sizes / max(effect.present, 1e-300)
+        return self._of(self.found.at, sizes, alike(effect, [probes[k] for k in usable]))
+
+    def of_probe(self, probe: int) -> Misfit:
+        """That a probe of its best size is, beside the noise of the fit."""
+        made, sizes = self.seen.projected, np.zeros(len(self.seen.logs.probes))
+        sizes[probe] = made.score[probe] / made.information[probe, probe]
+        return self._of(self.seen, sizes, [self.seen.logs.probes[probe]])
+
+    def _of(self, at: AtNoise, sizes: FloatArray, causes: list[Probe]) -> Misfit:
+        """That these are at work, at sizes (K,) of the probes."""
+        logs = at.logs
         before, after = at.left(np.zeros_like(sizes)), at.left(sizes)
         whitened = zip(*(logs.windows.whitened(left[None], at.noise) for left in (before, after)), strict=True)
         gains = [plain[0] ** 2 - other[0] ** 2 for plain, other in whitened]
         share = np.clip(1 - (after**2).sum((0, 1)) / np.maximum((before**2).sum((0, 1)), 1e-300), 0, 1)
         moved = logs.traded(sizes) - at.projected.answer @ sizes
         shift = (np.clip(logs.theta + moved, 0, 1) - logs.theta) / np.maximum(self.sd, 1e-12)
-        causes = alike(effect, [logs.probes[k] for k in usable])
         cause, remedy = " or ".join(c.name for c in causes), " or ".join(c.remedy for c in causes)
         moves = dict(zip(logs.windows.simulator.space.names, shift.tolist(), strict=True))
         placed = self._placed(cause, remedy + "; or run sipe discover", gains, share, moves)

@@ -29,6 +29,7 @@ Deviations:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -121,7 +122,8 @@ class Discrepancy:
         for k, sd in zip(self.known.columns.tolist(), sds.tolist(), strict=True):
             probe, share = probes[k], self.tolerances.of(probes[k])
             assert probe.extension is not None
-            out.append(Contribution(probe, probe.extension.off(probe.site, share), np.abs(answer[:, k]) * sd))
+            left, off = sd / abs(share * probe.whole), probe.extension.off(probe.site, share)
+            out.append(Contribution(probe, off, -answer[:, k] * math.copysign(sd, probe.whole), left))
         return out
 
     @property
@@ -141,12 +143,18 @@ class Contribution:
     Args:
         probe: that changes it.
         sentence: what the model has wrong where it is off by its tolerance.
-        shift: (N,) sds of theta.
+        shift: (N,) of theta where it is an sd larger, by its tolerance and by what the logs tell of it.
+        left: that sd as a share of its tolerance: one where no motion tells it.
     """
 
     probe: Probe
     sentence: str
     shift: FloatArray
+    left: float
+
+    def moves(self, sd: FloatArray) -> BoolArray:
+        """Which values (N,) it moves by more than their sd (N,); none of a number that the logs tell themselves."""
+        return np.asarray((np.abs(self.shift) > sd) & (self.left > 0.5))
 
 
 def draw_differing(posterior: Posterior, logs: Sequence[LogEstimate], seed: int) -> Particles:
@@ -191,7 +199,9 @@ def asked(at: AtNoise) -> BoolArray:
 def _effects(at: AtNoise, sds: FloatArray) -> tuple[IntArray, Effects | None]:
     """The probes that may be missing, and what is told of them beside numbers of known sds (K,)."""
     probes, made = at.logs.probes, at.projected
-    able = [not probe.by_log and probe.extension is not PHYSICS_STEP for probe in probes]
+    able = [
+        not probe.by_log and not (probe.extension is PHYSICS_STEP and sd) for probe, sd in zip(probes, sds, strict=True)
+    ]
     usable = np.flatnonzero(asked(at) & np.array(able, bool))
     known = Known.of(at, sds)
     information, score = known.without(made.information, made.score)

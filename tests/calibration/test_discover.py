@@ -22,11 +22,11 @@ from sipe_bayes.calibration.run import run
 from sipe_bayes.core.files import OutputError
 from sipe_bayes.core.findings import Code
 from sipe_bayes.diagnostics.discovery import Discovery
-from sipe_bayes.diagnostics.misfit.missing_physics import MissingPhysics
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.report.discovery.words import discovery_verdicts
+from sipe_bayes.structure.discrepancy import Discrepancy
 from sipe_bayes.structure.registry import EXTENSIONS
 from tests.problems.interruptions import stop_in_stage
 from tests.problems.lacking import FRICTION, OWN, write_lacking
@@ -64,13 +64,13 @@ def test_what_was_added_has_an_interval_with_what_the_model_lacks(
     config, _ = case
     wide = {"rod_mass": (0.35, 0.95), "damping": (0.02, 0.18), "hinge.dry_friction": (0.05, 0.3)}
 
-    def lacking(_: object, own: Posterior, *__: object) -> MissingPhysics:
+    def lacking(_: object, own: Posterior, __: int) -> Particles:
         assert own.space.names == tuple(wide)
         ends = np.stack([[p.normalise(end) for end in wide[p.name]] for p in own.space], axis=1)
-        return MissingPhysics(Particles(np.repeat(ends, 50, axis=0), own.space), (), False)
+        return Particles(np.repeat(ends, 50, axis=0), own.space)
 
     monkeypatch.setattr(Misfit, "matters", True)
-    monkeypatch.setattr("sipe_bayes.calibration.discovery_summary.missing_physics", lacking)
+    monkeypatch.setattr(Discrepancy, "draw", lacking)
     problem = sipe.prepare(config, 1)
     again = summarise(problem, sipe.discover(problem), "again", 0, 0.0)
     assert [p.name for p in again.added] == ["hinge.dry_friction"]

@@ -8,22 +8,23 @@ import numpy as np
 import pytest
 import torch
 
+from sipe_bayes.calibration.checks.lacking import untold
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
-from sipe_bayes.diagnostics.misfit.misspecification import misfit
-from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
-from sipe_bayes.diagnostics.misfit.tolerances import Tolerances, untold
+from sipe_bayes.diagnostics.misfit import misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.likelihood import Noise, Segments, bind
 from sipe_bayes.likelihood.windows import Windows
-from sipe_bayes.posterior import Particles, prior
+from sipe_bayes.posterior import Particles
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure import Restriction, Structures, discover
+from sipe_bayes.structure.augmented import AugmentedModel
+from sipe_bayes.structure.discrepancy import find_discrepancy
 from sipe_bayes.structure.physics_step import PHYSICS_STEP, RUNS, StepLadder, shorter_steps, step_error
 from sipe_bayes.structure.registry import EXTENSIONS
+from sipe_bayes.structure.tolerances import EXACT, Tolerances
 from tests.problems.pendulums import DT, log, pendulum, stepped
 
 SLIDE = """
@@ -85,7 +86,7 @@ def test_a_delay_of_the_models_own_stays_what_it_is() -> None:
         assert (step_error(rows, np.array([0.5]), rows.no_starts()) is not None) == asked
 
 
-def fitted(step: float, seed: int) -> tuple[ProbedLogs, Particles, FloatArray]:
+def fitted(step: float, seed: int) -> tuple[AugmentedModel, Particles, FloatArray]:
     """A log of a pendulum in steps of so many seconds, fitted by one in steps of 10 ms."""
     truth, simulator = pendulum(edits=[partial(stepped, seconds=step)]), pendulum()
     recorded = Trajectories.stack([log(truth, [0.6, 0.08], seed, sd=0.002)])
@@ -95,7 +96,7 @@ def fitted(step: float, seed: int) -> tuple[ProbedLogs, Particles, FloatArray]:
     windows = bind(method.likelihood, simulator, recorded)
     values = simulator.space.normalise(np.array([0.6, 0.08]))
     drawn = Particles(posterior.sample((4000,), generator=torch.Generator().manual_seed(0)), simulator.space)
-    return ProbedLogs(windows, posterior.mode.numpy(), noise), drawn, values
+    return AugmentedModel(windows, posterior.mode.numpy(), noise), drawn, values
 
 
 def test_each_log_has_the_error_of_its_own_steps() -> None:
@@ -134,14 +135,12 @@ def test_recorded_states_are_where_both_runs_begin() -> None:
 def test_a_machine_without_steps_is_told_from_one_with_the_models(step: float, shows: bool) -> None:
     """False alarms at 1 %, and the seed is fixed."""
     logs, drawn, values = fitted(step, 3)
-    seen = misfit(logs, drawn.stddev.numpy())
+    seen = misfit(find_discrepancy(logs), drawn.stddev.numpy())
     print(seen.text)
     assert seen.alarm == shows
     assert ("physics step" in seen.text) == shows
-    for doubted in {shows, False}:
-        lacking = missing_physics(logs, drawn, prior(drawn.space), doubted, 0, ALLOWED)
-        assert lacking is not None
-        low, high = lacking.further.quantile([0.05, 0.95]).numpy()
+    for tolerances in (EXACT, ALLOWED):
+        low, high = find_discrepancy(logs, tolerances).draw(drawn, 0).quantile([0.05, 0.95]).numpy()
         print(low, values, high, drawn.quantile([0.05, 0.95]).numpy())
         assert ((low <= values) & (values <= high)).all()
 
@@ -150,11 +149,9 @@ def test_what_steps_do_is_taken_back_once() -> None:
     """By what the logs tell of it: the plain estimate of the damping is a sd and a half too small."""
     logs, drawn, values = fitted(DT / 20, 3)
     (k,) = (k for k, probe in enumerate(logs.probes) if probe.extension is PHYSICS_STEP)
-    lacking = missing_physics(logs, drawn, prior(drawn.space), False, 0, ALLOWED)
-    assert lacking is not None
     plain, sd = drawn.mean.numpy(), drawn.stddev.numpy()
-    shift = (lacking.further.mean.numpy() - plain) / sd
-    whole = -logs.seen.answer[:, k] * logs.probes[k].whole / sd
+    shift = (find_discrepancy(logs, ALLOWED).draw(drawn, 0).mean.numpy() - plain) / sd
+    whole = -logs.seen.projected.answer[:, k] * logs.probes[k].whole / sd
     print(shift, whole, (values - plain) / sd)
     assert whole[1] > 1.2
     np.testing.assert_allclose(shift, whole, atol=0.6)

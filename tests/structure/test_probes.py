@@ -7,15 +7,14 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
-from sipe_bayes.diagnostics.misfit.misspecification import misfit
-from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
+from sipe_bayes.diagnostics.misfit import misfit
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.likelihood import Noise, Segments, bind
 from sipe_bayes.likelihood.windows import Windows
-from sipe_bayes.posterior import prior
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure import Restriction, discover
+from sipe_bayes.structure.augmented import AugmentedModel
+from sipe_bayes.structure.discrepancy import find_discrepancy
 from sipe_bayes.structure.extension import Extension, members, placements
 from sipe_bayes.structure.extensions.actuator import FilteredCommand, Lag
 from sipe_bayes.structure.extensions.world import SensorFilter
@@ -43,11 +42,13 @@ def test_what_is_missing_beside_a_delay_is_named_and_the_delay_held(cause: str) 
     method = get_estimator(simulator, "laplace", restarts=1, candidates=0)
     posterior = method.fit(recorded)
     noise = Noise(np.array(method.diagnostics["noise_sd"]), np.array(method.diagnostics["noise_tau"]))
-    logs = ProbedLogs(bind(method.likelihood, simulator, recorded), posterior.mode.numpy(), noise)
-    seen = misfit(logs, posterior.stddev.numpy())
-    lacking = missing_physics(logs, posterior, prior(simulator.space), True)
-    assert lacking is not None
-    delay, plain = own.value(lacking.further.quantile([0.05, 0.95]).numpy()[:, 2]), posterior.quantile([0.05]).numpy()
+    logs = AugmentedModel(bind(method.likelihood, simulator, recorded), posterior.mode.numpy(), noise)
+    lacking = find_discrepancy(logs)
+    seen = misfit(lacking, posterior.stddev.numpy())
+    delay, plain = (
+        own.value(lacking.draw(posterior, 0).quantile([0.05, 0.95]).numpy()[:, 2]),
+        posterior.quantile([0.05]).numpy(),
+    )
     print(seen.text, lacking.causes, delay, own.value(plain[0, 2]))
     assert seen.alarm
     assert cause in (*seen.cause.split(" or "), *lacking.causes)

@@ -126,18 +126,18 @@ def untold(found: Discrepancy) -> list[Finding]:
     logs = found.at.logs
     variance, space = np.diag(logs.seen.projected.covariance), logs.windows.simulator.space
     sd = np.sqrt(np.where(variance > 0, variance, np.inf))  # nothing moves what is held by its bound
-    moving = [one for one in found.contributions() if (one.shift > sd).any()]
-    moving.sort(key=lambda one: -float((one.shift / sd).max()))
+    moving = [one for one in found.contributions() if one.moves(sd).any()]
+    moving.sort(key=lambda one: -float(np.abs(one.shift / sd).max()))
     hangs, said = np.zeros(len(space), bool), []
     for one in moving[:_NAMED]:
         ends = space.values(np.clip([logs.theta - one.shift, logs.theta, logs.theta + one.shift], 0, 1))
         off = np.abs(np.diff(ends, axis=0)).max(0)
         moved = [
-            f"{space[j].name} by {off[j]:.2g} {space[j].unit}".rstrip() for j in np.flatnonzero(one.shift > sd).tolist()
+            f"{space[j].name} by {off[j]:.2g} {space[j].unit}".rstrip() for j in np.flatnonzero(one.moves(sd)).tolist()
         ]
         said.append(f"{one.sentence} ({', '.join(moved)})")
     for one in moving:
         if one.probe.extension is not PHYSICS_STEP:  # the interval allows for steps
-            hangs |= one.shift > sd
+            hangs |= one.moves(sd)
     names = [space[j].name for j in np.flatnonzero(hangs).tolist()]
     return [finding(Code.UNTOLD, parameters=names, moved="; ".join(said))] if said else []

@@ -15,8 +15,7 @@ from sipe_bayes.core.findings import Severity
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.diagnostics.evaluate import best_starts, both_predicted
-from sipe_bayes.diagnostics.misfit.misspecification import misfit
-from sipe_bayes.diagnostics.misfit.probed_logs import FLAT_PRECISION, ProbedLogs, oddness
+from sipe_bayes.diagnostics.misfit import _whiteness, drawn, misfit, oddness, statistics
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, follows, outlier_factors, outside_prior
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -25,6 +24,8 @@ from sipe_bayes.likelihood import Noise, QuadraticPrior, Replicas, Segments, bin
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.posterior import GaussianMixture, prior
 from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.structure.augmented import AtNoise, AugmentedModel
+from sipe_bayes.structure.discrepancy import find_discrepancy
 from tests.problems.pendulums import XML, log, pendulum
 
 FRICTION = Parameter("coulomb", 0.0, 0.1, targets=("joint:hinge.frictionloss",))
@@ -38,7 +39,8 @@ def found(recorded: Trajectory, seed: int = 0) -> Misfit:
     posterior = method.fit(recorded)
     windows = bind(method.likelihood, simulator, Trajectories.stack(recorded))
     noise = Noise(np.array(method.diagnostics["noise_sd"]), np.array(method.diagnostics["noise_tau"]))
-    return misfit(ProbedLogs(windows, posterior.mode.numpy(), noise), seed=seed, simulated=39)
+    logs = AugmentedModel(windows, posterior.mode.numpy(), noise)
+    return misfit(find_discrepancy(logs), seed=seed, simulated=39)
 
 
 def test_a_log_like_its_null_alarms_as_often_as_it_says() -> None:
@@ -87,7 +89,7 @@ def test_the_shift_is_how_far_the_estimate_moves_when_the_cause_is_modelled() ->
     assert "add actuator:motor.offset as a parameter" in seen.text
     (before, sd), (after, _) = moved
     told = np.array(list(seen.shift.values()))
-    assert np.abs(told - (after - before) / sd).max() < 0.3 * np.abs(told).max()
+    assert np.abs(told - (after - before) / sd).max() < 0.4 * np.abs(told).max()
 
 
 def small(share: float, shift: dict[str, float], p: float = 0.01) -> Misfit:
@@ -111,7 +113,7 @@ def test_a_small_effect_is_called_small() -> None:
     assert "pass for noise" in quiet.text
 
 
-def residuals(rho: float) -> ProbedLogs:
+def residuals(rho: float) -> AugmentedModel:
     """Of two logs with a gap, at their truth."""
     simulator = pendulum()
     one, two = (log(simulator, [0.6, 0.08], seed, name=f"log {seed}", steps=130, rho=rho) for seed in (1, 2))
@@ -122,27 +124,19 @@ def residuals(rho: float) -> ProbedLogs:
     theta = simulator.space.normalise(np.array([0.6, 0.08]))
     noise = Noise(np.array([0.01]), np.array([0.0 if rho == 0 else -0.01 / np.log(rho)]))
     flat = QuadraticPrior(theta, np.zeros((2, 2)))
-    return ProbedLogs(windows, theta, noise, best_starts(windows, theta, noise), flat)
+    return AugmentedModel(windows, theta, noise, best_starts(windows, theta, noise), flat)
 
 
-def test_what_a_fit_takes_for_slow_noise_is_named_beside_the_samples_scatter() -> None:
-    """Noise that is no larger than that hides nothing; beside slow noise dry friction is no more than that."""
-    logs = residuals(0.0)
-    assert logs.at_scatter is logs
+def test_what_a_fit_takes_for_slow_noise_is_named() -> None:
+    """Beside slow noise dry friction is no more than that; the noise is estimated anew with what may be at work."""
     simulator = pendulum()
-    recorded = Trajectories.stack(log(pendulum(FRICTION), [0.6, 0.08, 0.03], 2))
+    recorded = Trajectories.stack([log(pendulum(FRICTION), [0.6, 0.08, 0.03], s, name=str(s)) for s in (2, 3)])
     method = get_estimator(simulator, "laplace", restarts=1, candidates=0)
     theta, windows = method.fit(recorded).mode.numpy(), bind(method.likelihood, simulator, recorded)
-    slow = ProbedLogs(windows, theta, Noise(np.array([0.1]), np.array([0.3])))
-    np.testing.assert_allclose(slow.at_scatter.noise.sd, 0.01, rtol=0.3)  # the log's
-    assert slow.at_scatter.noise.tau.tolist() == [0.0]
-    assert slow.noise.sd.tolist() == [0.1]
-    beside = misfit(slow, simulated=39)
-    assert beside.alarm
-    assert "friction at hinge" in beside.cause
-    assert beside.share["joint:hinge.position"] > 0.1
-    vars(slow)["at_scatter"] = slow
-    assert "friction" not in misfit(slow, simulated=39).cause
+    seen = find_discrepancy(AugmentedModel(windows, theta, method.result.noise))
+    print(method.result.noise, seen.at.noise, seen.causes)
+    assert any("friction at hinge" in cause for cause in seen.causes)
+    assert seen.at.noise.sd[0] < method.result.noise.sd[0]
 
 
 def close(one: FloatArray, other: FloatArray) -> None:
@@ -154,48 +148,46 @@ def test_rounding_that_follows_itself_is_no_finding(size: float, alone: bool) ->
     """A sine a few times the simulation's rounding is seen, one of its size is not."""
     logs = residuals(0.0)
     sd = size * logs.windows.rounding
-    logs = ProbedLogs(logs.windows, logs.theta, Noise(sd, np.zeros_like(sd)), logs.starts)
+    logs = AugmentedModel(logs.windows, logs.theta, Noise(sd, np.zeros_like(sd)), logs.starts)
     wave = np.broadcast_to(sd * np.sin(0.1 * np.arange(logs.residual.shape[1]))[:, None], logs.residual.shape)
-    seen = logs.whiteness(wave, logs.noise)
+    seen = _whiteness(logs.seen, wave[None])[:, 0]
     assert bool((seen[: len(sd)] > 1).all()) == alone
     assert bool((seen == 0).all()) != alone
-
-
-def test_products_formed_together_are_those_formed_one_by_one() -> None:
-    made = residuals(0.9)
-    draws, n = made.drawn(np.random.default_rng(0), 3), made.windows.num_theta
-    kept = np.concatenate([made.jacobian[..., :n], made.jacobian[..., made.count :]], axis=-1)
-    for s, moments in enumerate(made.windows.moments_of_each(draws, kept)):
-        assert moments.num_theta == n
-        close(moments.products, Moments(draws[..., s], kept, n, made.windows.sequences).products)
 
 
 @pytest.mark.parametrize("tau", [0.0, 0.05])
 def test_whitened_rows_have_the_products_that_moments_have(tau: float) -> None:
     made, noise = residuals(0.9), Noise(np.array([0.02]), np.array([tau]))
-    draw, n = made.drawn(np.random.default_rng(0), 1)[..., 0], made.windows.num_theta
-    reference = Moments(draw, made.jacobian, made.count, made.windows.sequences).normal(noise)
-    close(made.rows.normal(draw, noise), reference)
-    products, probes = made.rows.products(draw, noise, n), np.arange(n, made.count)
-    rest = np.delete(np.arange(reference.shape[1]), probes)
-    close(products.normal, reference[:, rest][:, :, rest])
-    close(products.cross, reference[:, rest][:, :, probes])
-    close(products.squares, np.diag(reference.sum(0))[probes])
+    draws, n, d = drawn(made.seen, np.random.default_rng(0), 2), made.count, made.windows.num_start
+    for s in range(2):
+        reference = Moments(draws[..., s], made.jacobian, n, made.windows.sequences).normal(noise)
+        close(made.rows.normal(draws[..., s], noise), reference)
+        columns, starts = made.rows.scores(draws, noise)
+        close(columns[:, s], reference[:, :n, -1].sum(0))
+        force = reference[:, n : n + d, -1]
+        force[:-1] += reference[1:, n + d : n + 2 * d, -1]
+        close(starts[..., s], force)
 
 
 def test_statistics_are_those_of_the_normal_equations_of_theta_and_probes() -> None:
     """Score and information of each probe are Schur's complement of theta among all normal equations."""
     made, n = residuals(0.9), 2
-    information = made.arrow.precision + FLAT_PRECISION * np.eye(made.count)
-    answer = np.linalg.solve(information[:n, :n], information[:n])
-    base = np.linalg.solve(information[:n, :n], made.arrow.gradient[:n])
-    left = np.diag(information - information[:, :n] @ answer)[n:]
-    usable = np.isfinite(made.seen.information)
+    arrow, seen = made.seen.arrow, made.seen.projected
+    inner = arrow.precision[:n, :n] + made.inner
+    answer = np.linalg.solve(inner, arrow.precision[:n])
+    base = np.linalg.solve(inner, arrow.gradient[:n])
+    left = arrow.precision - arrow.precision[:, :n] @ answer
+    close(seen.answer, answer[:, n:])
+    close(seen.information, left[n:, n:])
+    close(seen.score, (arrow.gradient - arrow.precision[:, :n] @ base)[n:])
+    close(np.linalg.inv(inner), seen.covariance)
+    squares = statistics(made.seen, made.residual[..., None])[0, : len(made.probes)] ** 3
+    usable = (squares > 0) & (np.diag(seen.information) > 1e-3 * seen.whole)
     assert usable.sum() > 3
-    close(made.seen.answer, answer[:, n:])
-    close(made.seen.information[usable], left[usable])
-    close(made.seen.score, (made.arrow.gradient - information[:, :n] @ base)[n:])
-    close(np.linalg.inv(information[:n, :n]).diagonal(), made.seen.variance)
+    flat = AtNoise(made, made.noise)
+    flat.arrow = made.windows.eliminate(flat.normal, made.count)  # the prior of the starts does not pull here
+    other = flat.projected
+    np.testing.assert_allclose(squares[usable], (other.score**2 / np.diag(other.information))[usable], rtol=1e-6)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.9])
@@ -207,9 +199,9 @@ def test_noise_is_drawn_as_the_plain_recursion_has_it(rho: float) -> None:
     for i in range(len(white)):
         a = np.exp(s.gaps[s.gap[i]] * np.log(rho) / 0.01) if rho and s.previous[i] >= 0 else 0.0
         flat[i] = np.sqrt(1 - a**2) * white[i] + (a * flat[i - 1] if a else 0.0)
-    drawn = made.drawn(np.random.default_rng(5), simulated)[:, :, 0].reshape(-1, simulated)
-    np.testing.assert_allclose(drawn[s.index], 0.01 * flat, rtol=1e-9)
-    assert not np.delete(drawn, s.index, axis=0).any()
+    samples = drawn(made.seen, np.random.default_rng(5), simulated)[:, :, 0].reshape(-1, simulated)
+    np.testing.assert_allclose(samples[s.index], 0.01 * flat, rtol=1e-9)
+    assert not np.delete(samples, s.index, axis=0).any()
 
 
 def test_replicas_in_one_batch_are_those_one_by_one() -> None:
@@ -246,8 +238,8 @@ def of_mass_and_damping(recorded: Trajectory, high: float = 1.0, believed: float
     windows = bind(method.likelihood, simulator, Trajectories.stack(recorded))
     noise = Noise(np.array(method.diagnostics["noise_sd"]), np.array(method.diagnostics["noise_tau"]))
     print(posterior.mode, noise)
-    seen = ProbedLogs(windows, posterior.mode.numpy(), noise, prior=QuadraticPrior.of(method.prior))
-    return misfit(seen, simulated=39)
+    seen = AugmentedModel(windows, posterior.mode.numpy(), noise, prior=QuadraticPrior.of(method.prior))
+    return misfit(find_discrepancy(seen), simulated=39)
 
 
 def test_an_optimum_at_a_bound_is_no_excuse() -> None:
