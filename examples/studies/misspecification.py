@@ -26,16 +26,17 @@ from typing import Any
 import mujoco
 import numpy as np
 from _kept import fits, keep
-from sipe_bayes.diagnostics.misfit.misspecification import misfit
-from sipe_bayes.diagnostics.misfit.probed_logs import MISFIT, ProbedLogs
 
 import sipe_bayes as sipe
 from sipe_bayes.core.files import write_text
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.diagnostics.misfit import MISFIT, misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood import Noise, bind
+from sipe_bayes.structure.augmented import AugmentedModel
+from sipe_bayes.structure.discrepancy import find_discrepancy
 from sipe_bayes.structure.registry import get_extension
 
 HERE = Path(__file__).parent
@@ -110,7 +111,7 @@ def one(engine: sipe.Simulator, cell: str, size: float, rho: float, seed: int) -
     posterior = method.fit(log)
     noise = Noise(*(np.array(method.diagnostics[key]) for key in ("noise_sd", "noise_tau")))
     windows = bind(method.likelihood, engine, Trajectories.stack(log))
-    result = misfit(ProbedLogs(windows, posterior.mode.numpy(), noise), seed=seed)
+    result = misfit(find_discrepancy(AugmentedModel(windows, posterior.mode.numpy(), noise)), seed=seed)
     return {"seed": seed, "cpu_seconds": round(time.process_time() - began, 2), **asdict(result)}
 
 

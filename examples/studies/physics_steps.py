@@ -25,10 +25,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from late_sensors import MACHINES, MODELS, Machine
-from sipe_bayes.diagnostics.misfit.missing_physics import missing_physics
-from sipe_bayes.diagnostics.misfit.misspecification import misfit
-from sipe_bayes.diagnostics.misfit.probed_logs import ProbedLogs
-from sipe_bayes.diagnostics.misfit.tolerances import Tolerances
 
 import sipe_bayes as sipe
 from sipe_bayes.benchmark.measurement import source
@@ -36,13 +32,16 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import write_text
 from sipe_bayes.core.findings import Severity
 from sipe_bayes.core.parameters import Parameter
+from sipe_bayes.diagnostics.misfit import misfit
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.likelihood import Noise, QuadraticPrior, bind
-from sipe_bayes.posterior import prior
+from sipe_bayes.structure.augmented import AugmentedModel
+from sipe_bayes.structure.discrepancy import find_discrepancy
 from sipe_bayes.structure.extension import WORLD
 from sipe_bayes.structure.physics_step import PHYSICS_STEP
+from sipe_bayes.structure.tolerances import Tolerances
 
 RESULTS = Path(__file__).parent / "results" / "physics_steps.json"
 FINE, STEPS = 2e-4, (0.002, 0.005)  # seconds
@@ -130,11 +129,9 @@ def one_log(name: str, timestep: float, of_machine: float, seed: int) -> Seen:
     windows, here = bind(method.likelihood, simulator, logs), posterior.mode.numpy()
     noise = Noise(*(np.array(method.diagnostics[key]) for key in ("noise_sd", "noise_tau")))
     own = QuadraticPrior.of(method.prior)
-    probed = ProbedLogs(windows, here, noise, method.result.starts_at(here), own)
-    looks = misfit(probed, posterior.stddev.numpy(), seed)
-    known = Tolerances(physics_step=1.0)
-    missing = missing_physics(probed, posterior, prior(simulator.space), looks.alarm, seed, known)
-    further = posterior if missing is None else missing.further
+    logs_there = AugmentedModel(windows, here, noise, method.result.starts_at(here), own)
+    found = find_discrepancy(logs_there, Tolerances(physics_step=1.0))
+    looks, further = misfit(found, posterior.stddev.numpy(), seed), found.draw(posterior, seed)
     ends = [np.asarray(one.quantile([0.05, 0.95]).numpy()) for one in (posterior, further)]
     held = [(low <= theta) & (theta <= high) for low, high in ends]
     widths = [high - low for low, high in ends]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,9 +13,10 @@ from sipe_bayes.calibration.discovery_summary import summarise
 from sipe_bayes.calibration.output import CHECKPOINT, IDENTITY, claimed, describe_run
 from sipe_bayes.calibration.problem import Problem, prepare
 from sipe_bayes.calibration.run import run_name
+from sipe_bayes.core.validation import at_least
 from sipe_bayes.diagnostics.discovery import Discovery
 from sipe_bayes.inference.recorded import Progress
-from sipe_bayes.structure.discover import Restriction, check_restriction
+from sipe_bayes.structure.discover import Restriction, SearchInterrupted, check_restriction
 from sipe_bayes.structure.discover import discover as search
 from sipe_bayes.structure.state import BUDGET, DiscoverOptions
 from sipe_bayes.structure.structures import Structures
@@ -30,6 +32,7 @@ def discover(
     without: Sequence[str] = (),
     seed: int | None = None,
     budget: int | None = None,
+    time_limit: float | None = None,
     options: DiscoverOptions | None = None,
     checkpoint: Path | None = None,
     progress: Progress | None = None,
@@ -42,6 +45,7 @@ def discover(
         without: names that are left out, beside the configuration's.
         seed: default the configuration's.
         budget: rollouts of all fits; default the configuration's, then 30,000.
+        time_limit: s, after which the search ends with what it has; default none. The model as it is is fitted.
         options: of the search.
         checkpoint: a file to go on from and to keep up to date; the same call goes on to the same bits, and one with
             a larger budget where the smaller one was spent.
@@ -52,6 +56,7 @@ def discover(
 
     Raises:
         ValueError: for input that cannot be used; the message is one line with the remedy.
+        SearchInterrupted: with what the search has, where it is interrupted.
     """
     problem = problem if isinstance(problem, Problem) else prepare(problem)
     config = problem.config
@@ -65,6 +70,7 @@ def discover(
         options=options,
         budget=_budget(problem, budget),
         seed=config.seed if seed is None else seed,
+        time_limit=math.inf if time_limit is None else at_least("time_limit", time_limit, 0),
         checkpoint=checkpoint,
         progress=progress,
     )
@@ -99,11 +105,12 @@ def run_discovery(
     without: Sequence[str] = (),
     num_threads: int | None = None,
     progress: Progress | None = None,
+    time_limit: float | None = None,
 ) -> Discovery:
     """What the command does: read, claim the output folder, search with a checkpoint, write everything.
 
-    Every input is checked before the folder is touched, the user's own extensions among it. The same call after an
-    interruption goes on.
+    Every input is checked before the folder is touched, the user's own extensions among it. What an interrupted search
+    has is written as well; the same call goes on.
 
     Args:
         config: the TOML file.
@@ -114,6 +121,7 @@ def run_discovery(
         without: names that are left out.
         num_threads: native ones; default all cores.
         progress: called along the way.
+        time_limit: s of the search, as of ``discover``.
 
     Raises:
         ValueError: for input that cannot be used; the message is one line with the remedy.
@@ -132,15 +140,21 @@ def run_discovery(
         "extensions_sha256": restriction.digests,
     }
     with claimed(folder, {**record, "status": "started"}, keys=_KEYS):
-        structures = discover(
-            problem,
-            only=only,
-            without=without,
-            seed=chosen,
-            budget=budget,
-            checkpoint=folder / CHECKPOINT,
-            progress=progress,
-        )
+        try:
+            structures = discover(
+                problem,
+                only=only,
+                without=without,
+                seed=chosen,
+                budget=budget,
+                time_limit=time_limit,
+                checkpoint=folder / CHECKPOINT,
+                progress=progress,
+            )
+        except SearchInterrupted as interruption:  # who is told waits for what there is, or interrupts again
+            if not interruption.structures.fitted:
+                raise
+            structures = interruption.structures
 
         def tell(what: str) -> None:
             if progress is not None:

@@ -100,6 +100,7 @@ def summarise(
         named_share=structures.named_share,
         settled=structures.settled,
         best_settled=structures.best.settled,
+        ended=structures.search.ended if structures.state.cut is not None else "",
         rollouts=structures.rollouts,
         column_rollouts=structures.state.column_rollouts,
         seconds=time.monotonic() - began,
@@ -114,11 +115,20 @@ def summarise(
 def _budget_spent(structures: Structures) -> list[Finding]:
     """What the budget did not reach: the end of the search, or all signs and units of columns."""
     state, budget, noticed = structures.state, structures.search.budget, []
-    about = functools.partial(finding, budget=budget, larger=_LARGER * budget)
+    larger = _LARGER * budget
     if state.cut in _BEFORE:
-        noticed.append(about(Code.STRUCTURES_CUT_SHORT, before=_BEFORE[state.cut], untried=_untried(structures)))
+        why, remedy = {
+            "budget": (f"with its budget of {budget} rollouts", f"give --budget {larger}"),
+            "time": ("at its time limit", "give a longer --time-limit"),
+            "interrupted": ("when it was interrupted", "run the same command"),
+        }[structures.search.ended]
+        before, untried = _BEFORE[state.cut], _untried(structures)
+        cut = finding(Code.STRUCTURES_CUT_SHORT, why=why, before=before, untried=untried, remedy=remedy)
+        noticed.append(cut)
     if state.untried:
-        noticed.append(about(Code.COLUMNS_UNTRIED, count=len(state.untried), example=state.untried[0].sentence))
+        count, example = len(state.untried), state.untried[0].sentence
+        untold = finding(Code.COLUMNS_UNTRIED, count=count, example=example, budget=budget, larger=larger)
+        noticed.append(untold)
     return noticed
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sipe_bayes.cli.errors import check_least, exit_on_error
+from sipe_bayes.cli.errors import INTERRUPTED, check_least, exit_on_error
 from sipe_bayes.inference.progress_bar import ProgressBar
 
 if TYPE_CHECKING:
@@ -69,20 +69,25 @@ def discover(
     without: Annotated[list[str] | None, typer.Option(help="An extension that is left out; repeat it.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
     threads: Annotated[int | None, typer.Option(help="Native threads; default all cores.")] = None,
+    time_limit: Annotated[
+        float | None, typer.Option(help="Seconds, after which the search ends with what it has.")
+    ] = None,
 ) -> None:
     """Physics that the model lacks: proposed, fitted, and compared by what it predicts of pieces that were held out."""
     from sipe_bayes.calibration.discover import run_discovery
     from sipe_bayes.core.files import to_json
 
     with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json, counted=False) as progress:
-        check_least(0, seed=seed)
+        check_least(0, seed=seed, time_limit=time_limit)
         check_least(1, budget=budget, threads=threads)
         paced = Paced(progress)
-        discovery = run_discovery(config, out, seed, budget, only or None, without or (), threads, paced)
+        discovery = run_discovery(config, out, seed, budget, only or None, without or (), threads, paced, time_limit)
     if as_json:
         print(to_json(discovery.to_dict()))
     else:
         print_discovery(discovery)
+    if discovery.ended == "interrupted":
+        raise typer.Exit(INTERRUPTED)
 
 
 def print_discovery(discovery: Discovery) -> None:

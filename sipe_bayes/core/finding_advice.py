@@ -92,8 +92,8 @@ ADVICE: dict[Code, str] = {
         "shows in a few moments only, cut the logs to these."
     ),
     Code.STRUCTURES_CUT_SHORT: (
-        "What was not fitted may be what the model lacks. Give a larger budget, with which the same folder goes on, or "
-        "fewer candidates by `--only` and `structure.sites`."
+        "What was not fitted may be what the model lacks. Give a larger budget or more time, with which the same "
+        "folder goes on, or fewer candidates by `--only` and `structure.sites`."
     ),
     Code.COLUMNS_UNTRIED: (
         "Much of a channel is unexplained, and not every column could be tried for it. Look at the signals in the "

@@ -130,8 +130,7 @@ class Code(Enum):
         "result uses all"
     )
     STRUCTURES_CUT_SHORT = blocking(
-        "the budget of {budget} rollouts was spent before {before}{untried}: give --budget {larger}, and the same "
-        "folder goes on"
+        "the search ended {why} before {before}{untried}: {remedy}, and the same folder goes on"
     )
     COLUMNS_UNTRIED = caution(
         "{count} signs and units of columns were not tried, for which a share of the budget of {budget} rollouts was "

@@ -138,6 +138,7 @@ class Discovery:
         run: record of the run.
         out: folder of the results.
         best_settled: whether the fit of the structure that is written out came to rest.
+        ended: what cut the search short: its "budget", its "time", or that it was "interrupted"; else nothing.
     """
 
     name: str
@@ -165,6 +166,7 @@ class Discovery:
     run: Mapping[str, object] = field(default_factory=dict)
     out: str = ""
     best_settled: bool = True
+    ended: str = ""
 
     @property
     def kept(self) -> tuple[Piece, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +26,7 @@ from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.physics_step import PhysicsStep
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
 from sipe_bayes.structure.search import StructureSearch
-from sipe_bayes.structure.state import BUDGET, DiscoverOptions, DiscoverState
+from sipe_bayes.structure.state import BUDGET, DiscoverOptions, DiscoverState, Phase
 from sipe_bayes.structure.structures import Structures
 
 _SAVE_SECONDS = 1.0
@@ -86,6 +87,7 @@ def discover(
     options: DiscoverOptions | None = None,
     budget: int = BUDGET,
     seed: int = 0,
+    time_limit: float = math.inf,
     checkpoint: Path | None = None,
     progress: Progress | None = None,
 ) -> Structures:
@@ -101,6 +103,7 @@ def discover(
         options: of the search.
         budget: rollouts at most.
         seed: of the searches.
+        time_limit: s, after which the search ends with what it has; not before the model as it is was fitted.
         checkpoint: a file to go on from and to keep up to date; the same call goes on to the same bits, and one with
             a larger budget where the smaller one was spent.
         progress: called along the way.
@@ -109,11 +112,13 @@ def discover(
         ValueError: for a simulator of anything but an MJCF, unknown extensions, sites that the model does not have, or
             logs through impacts.
         CheckpointError: for a checkpoint that is damaged or of another run.
-        KeyboardInterrupt: with what the search has, in words.
+        SearchInterrupted: with what the search has, where it is interrupted.
     """
+    began = time.monotonic()
     given = simulator, trajectories, holdout, prior, likelihood, restriction, options, budget, seed, progress
     search = _search(*given)
     fingerprint = _fingerprint(search, simulator, restriction or Restriction())
+    search.given = search.fitting = replace(search.fitting, ends=began + time_limit)
     state = DiscoverState(budget=search.budget)
     if checkpoint is not None and checkpoint.exists():
         enough = search.enough([]) / search.options.plain_share
@@ -127,8 +132,18 @@ def discover(
                 saved = time.monotonic()
         search.place(state)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(Structures(search, state).so_far) from None  # who is told need not wait for the end
+        search.ended = "interrupted"
+        ended = state if state.done else replace(state, phase=Phase.DONE, cut=state.phase)
+        raise SearchInterrupted(Structures(search, ended)) from None
     return Structures(search, state)
+
+
+class SearchInterrupted(KeyboardInterrupt):
+    """A search that was interrupted, with what it has so far in words and as ``structures``."""
+
+    def __init__(self, structures: Structures) -> None:
+        super().__init__(structures.so_far)
+        self.structures = structures
 
 
 def check_restriction(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -88,6 +90,7 @@ class Fitting:
         prior: of the user's parameters.
         seed: of the searches.
         num_threads: native ones.
+        ends: on the monotonic clock, when fits end with what they have.
     """
 
     environment: MjcfEnvironment
@@ -97,6 +100,7 @@ class Fitting:
     prior: Posterior
     seed: int
     num_threads: int
+    ends: float = math.inf
 
     def enough(self, placed: Sequence[Placed]) -> int:
         """Rollouts of as many steps of a fit as lead to its optimum."""
@@ -189,6 +193,7 @@ class Fitting:
             initial=given,
             tuning=EVIDENCE_TUNING,
         )
+        laplace.time_limit = max(self.ends - time.monotonic(), 0.0)
         laplace.fit(self.trajectories)
         assert laplace.result is not None
         return laplace.result, laplace.rollouts

@@ -24,6 +24,7 @@ that gains less than eight in the end is never clear of its own standard error.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -31,7 +32,7 @@ from functools import partial
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.budget import BudgetExhausted, BudgetTooSmall
+from sipe_bayes.core.budget import BudgetExhausted, BudgetTooSmall, Deadline
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood import BoundLikelihood, QuadraticPrior
 from sipe_bayes.structure.augmented import AugmentedModel
@@ -72,6 +73,7 @@ class StructureSearch:
         self.extensions, self.joints, self.finer = tuple(extensions), joints, finer
         self.options, self.budget, self.progress = options or DiscoverOptions(), budget, progress
         self._rollouts, self._fit_rollouts, self._doing = 0, 0, ""  # before the present fit, of it, and what it is for
+        self.ended = "budget"  # what ends a search that is cut short: that, "time", or "interrupted"
         self._machine: Machine | None = None
         self._placed: dict[str, Placed] = {}
         self._ladder = StepLadder()
@@ -82,7 +84,10 @@ class StructureSearch:
         self._rollouts, self._fit_rollouts = state.rollouts, 0
         self._doing = state.describe(len(self._ladder.pieces(self._placed)))
         self._tell("")
-        if state.phase is not Phase.PLAIN and state.rollouts >= self.budget:
+        spent = state.rollouts >= self.budget or time.monotonic() > self.fitting.ends
+        if time.monotonic() > self.fitting.ends:
+            self.ended = "time"
+        if state.phase is not Phase.PLAIN and spent:
             return replace(state, phase=Phase.DONE, cut=state.cut if state.done else state.phase)
         state = {
             Phase.PLAIN: self._plain,
@@ -255,6 +260,7 @@ class StructureSearch:
         rest = [p for p in self._placed.values() if p.extension.last_resort == last_resort and p.parameters]
         rest = [p for p in rest if not taken & {p.label, *(t for q in p.parameters for t in q.targets)}]
         windows.budget, ranked, cut, gain = self._left(state), list[Candidate](), None, 0.0
+        windows.deadline = Deadline(fitting.ends)
         finer = None if last_resort else self._ladder.finer(here.labels)
         try:
             if rest or finer is not None:
@@ -336,6 +342,7 @@ class StructureSearch:
             most = self.enough(labels)
             cut = state.phase if left < most else None
             one = self.fitting.fit(self.structure(labels), initial, max(min(most, left), 1), self._tell)
+            cut = state.phase if time.monotonic() > self.fitting.ends else cut
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
             spent = state.failed_rollouts + self._fit_rollouts
             cut = cut if isinstance(error, BudgetTooSmall) else None

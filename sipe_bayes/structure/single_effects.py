@@ -197,22 +197,28 @@ def find_effects(columns: Columns, options: EffectOptions = EFFECTS) -> Effects:
         columns: K of them, with information each.
         options: of the prior.
     """
-    effects: list[SingleEffect] = []
-    sd = np.sqrt(np.diag(columns.information))
-    sizes = np.zeros((options.effects, len(columns.score)))
-    while len(effects) < options.effects and (not effects or effects[-1].present > 0.5):
-        effects.append(SingleEffect.of(columns, columns.score - columns.information @ sizes.sum(0), options))
-        sizes[len(effects) - 1] = effects[-1].sizes
-        for _ in range(options.rounds):
-            before = sizes.copy()
-            for k in range(len(effects)):
-                rest = sizes.sum(0) - sizes[k]
-                effects[k] = SingleEffect.of(columns, columns.score - columns.information @ rest, options)
-                sizes[k] = effects[k].sizes
-            if (np.abs(sizes - before) * sd).max() < _SETTLED:
-                break
-        if sum(effect.present <= 0.5 for effect in effects) > 1:  # the new one shares what another has
-            effects.pop()
-            sizes[len(effects)] = 0.0
-    left = columns.score - columns.information @ sizes.sum(0)
+    effects = list[SingleEffect]()
+    for _ in range(options.effects):
+        more = _settled(columns, effects, options)
+        if sum(effect.present <= 0.5 for effect in more) > 1:  # the new one shares what another had
+            break
+        effects = more
+        if min(effect.present for effect in effects) <= 0.5:
+            break
+    left = columns.score - columns.information @ sum(effect.sizes for effect in effects)
     return Effects(tuple(sorted(effects, key=lambda e: -e.present)), AllEffects(columns, left, options))
+
+
+def _settled(columns: Columns, effects: Sequence[SingleEffect], options: EffectOptions) -> list[SingleEffect]:
+    """These and a new one, each fitted to what the others leave until they settle."""
+    made, sd = list(effects), np.sqrt(np.diag(columns.information))
+    sizes = np.array([*(effect.sizes for effect in effects), np.zeros(len(columns.score))])
+    for _ in range(options.rounds):
+        before = sizes.copy()
+        for k in reversed(range(len(sizes))):
+            rest = sizes.sum(0) - sizes[k]
+            made[k : k + 1] = [SingleEffect.of(columns, columns.score - columns.information @ rest, options)]
+            sizes[k] = made[k].sizes
+        if (np.abs(sizes - before) * sd).max() < _SETTLED:
+            break
+    return made
