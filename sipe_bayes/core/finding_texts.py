@@ -248,7 +248,7 @@ class Code(Enum):
         "noise of {channels} has a correlation time as long as the logs ({tau:.2g} s): mostly changes from sample to "
         "sample were fitted, hardly where the motion goes"
     )
-    MISFIT_NOT_ASKED = note("Whether the residuals are noise is not tested: segments meet impacts")
+    MISFIT_NOT_ASKED = note("Whether the residuals are noise is not tested: in hardly any segment nothing touches")
     NOISE_FREE = note(
         "the model explains the logs but for {share:.0e} of what they move, as where they were simulated without "
         "noise: what is left is rounding, and says nothing of the model; the intervals are those of rounding too"

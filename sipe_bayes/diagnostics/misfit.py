@@ -37,7 +37,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import Misfit
-from sipe_bayes.structure.augmented import FLAT_PRECISION, AtNoise
+from sipe_bayes.structure.augmented import AUGMENTED, FLAT_PRECISION, AtNoise
 from sipe_bayes.structure.discrepancy import Discrepancy
 from sipe_bayes.structure.probes import Probe
 from sipe_bayes.structure.single_effects import SingleEffect
@@ -52,7 +52,6 @@ class MisfitOptions(Options):
     lags: tuple[int, ...] = option((1, 2, 3, 5, 8, 13, 21, 34), "of a channel's memory, at every scale", "samples")
     alike: float = option(0.2, "of the likeliest cause's probability, from which another is named beside it", least=0)
     causes: int = option(3, "that are named at most", least=1)
-    rounding: float = option(2.0, "of the simulation's rounding, below which noise is that", least=1)
 
 
 MISFIT = MisfitOptions()
@@ -130,7 +129,7 @@ def _whiteness(at: AtNoise, left: FloatArray) -> FloatArray:
     itself. Of coloured noise the first autocorrelation is taken out, as an estimate of the noise would.
     """
     logs = at.logs
-    tells = at.noise.sd >= MISFIT.rounding * logs.windows.rounding
+    tells = at.noise.sd >= AUGMENTED.rounding * logs.windows.rounding
     memory, bursts = [], []
     for z, told in zip(logs.windows.whitened(left, at.noise), tells, strict=True):
         z = z * told

@@ -19,7 +19,7 @@ import copy
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -28,7 +28,7 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.budget import BudgetExhausted, Deadline
 from sipe_bayes.core.rotations import nearest, written_near
-from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood.block_tridiagonal import Eliminated
 from sipe_bayes.likelihood.moments import Moments
 from sipe_bayes.likelihood.noise import Noise, chosen_sd, noise_level, noise_scales, pooled, whiten
@@ -45,7 +45,7 @@ from sipe_bayes.likelihood.starts.estimates import (
 )
 from sipe_bayes.likelihood.starts.history import FilterStarts, past_commands, with_history
 from sipe_bayes.likelihood.starts.measured import MeasuredStarts, measurement_sd
-from sipe_bayes.simulation.contacts import Contacts, may_touch
+from sipe_bayes.simulation.contacts import Contacts, apart_along, may_touch
 from sipe_bayes.simulation.prompt import prompt
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import moved
@@ -200,6 +200,29 @@ class Windows:
     def contacts(self) -> Contacts:
         """What bodies touch along the logs."""
         return contacts_of(self.simulator, [self.trajectories[k] for k in np.unique(self.log).tolist()])
+
+    @property
+    def apart(self) -> BoolArray:
+        """(W,): in which windows nothing touches."""
+        logs = {k: apart_along(self.simulator, self._sampled(k)) for k in np.unique(self.log).tolist()}
+        ends = zip(self.log.tolist(), self.start.tolist(), (self.start + self.steps).tolist(), strict=True)
+        return np.array([logs[k][first : last + 1].all() for k, first, last in ends], bool)
+
+    def spans_apart(self, least: int) -> list[Trajectory]:
+        """The spans of the logs, of so many control steps at least, in which nothing touches."""
+        spans = list[Trajectory]()
+        for k in np.unique(self.log).tolist():
+            log, apart = self.trajectories[k], apart_along(self.simulator, self._sampled(k))
+            edges = np.flatnonzero(np.diff(np.concatenate([[False], apart, [False]]).astype(int)))
+            for first, last in zip(edges[::2].tolist(), (edges[1::2] - 1).tolist(), strict=True):
+                if last - first >= least:
+                    name = f"{log.name} from {first * log.dt:.4g} s"
+                    spans.append(replace(log.slice(first, last), name=name))
+        return spans
+
+    def _sampled(self, log: int) -> FloatArray:
+        """States (T+1, S) along a log by its samples, which smoothing would lift off what they touch."""
+        return estimate_states(self.simulator, self.trajectories[log], True)
 
     def mask(self, samples: IntArray) -> None:
         """Leave out samples (k, 3), each by log, number in it and channel of the model, and no others.

@@ -18,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.diagnostics.records import Residual, Signal
 from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
-from sipe_bayes.posterior import Particles
+from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.report.colours import CHAINS, DEFAULT, HOLDOUT, MEASURED, POSTERIOR, PRIOR, STYLE
 from sipe_bayes.report.drawing import column_of_panels, equal_parts, fixed_grid, label_y, new_figure, styled, ticks
 from sipe_bayes.report.legends import line_handle, shade_handle
@@ -107,16 +107,25 @@ def pair_names(calibration: Calibration, theta: FloatArray) -> list[str]:
 # Marginals and pairs
 
 
+def printed_posterior(calibration: Calibration) -> Posterior:
+    """That whose intervals are printed first: with what the model lacks or may lack, where that was asked."""
+    return calibration.posterior if calibration.further is None else calibration.further
+
+
 @styled
 def marginals(calibration: Calibration) -> list[Figure]:
-    """One panel per parameter, nuisance ones last: posterior, prior, 90 % interval, default; the prior range above."""
-    theta, space, figures = draws(calibration.posterior), calibration.posterior.space, []
+    """One panel per parameter, nuisance ones last: posterior, prior, 90 % interval, default; the prior range above.
+
+    The posterior is that with what the model lacks or may lack; the one that takes it for right is dotted.
+    """
+    theta, space, figures = draws(printed_posterior(calibration)), calibration.posterior.space, []
+    plain = None if calibration.further is None else draws(calibration.posterior)
     for part in equal_parts(ordered(calibration.parameters), SIZES.parameters):
         columns = [space.index(summary.name) for summary in part]
         chosen = [space[j] for j in columns]
-        ends = [p.normalise(np.array([s.q05, s.q95])) for p, s in zip(chosen, part, strict=True)]
+        ends = [p.normalise(np.array(s.further or (s.q05, s.q95))) for p, s in zip(chosen, part, strict=True)]
         shown = (chosen, theta[:, columns], calibration.prior, np.stack(ends, axis=1), [None] * len(part))
-        figures.append(marginal_grid(*shown))
+        figures.append(marginal_grid(*shown, None if plain is None else plain[:, columns]))
     return figures
 
 
@@ -127,7 +136,7 @@ def pairs(calibration: Calibration, names: Sequence[str] | None = None) -> list[
     Returns:
         One figure; none for fewer than two parameters.
     """
-    theta, space = draws(calibration.posterior), calibration.posterior.space
+    theta, space = draws(printed_posterior(calibration)), calibration.posterior.space
     names = pair_names(calibration, theta) if names is None else list(names)[:MAX_PAIRS]
     if len(names) < 2:
         return []

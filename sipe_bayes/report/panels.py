@@ -113,6 +113,7 @@ def marginal(
     interval: FloatArray,
     default: Place,
     truth: Place = None,
+    plain: FloatArray | None = None,
 ) -> None:
     """One parameter in its unit: density and interval, the prior, the model as given, the truth; the range above.
 
@@ -126,6 +127,7 @@ def marginal(
         interval: the two ends of the 90 % interval, in theta.
         default: the model as given.
         truth: if it is known; may lie outside [0, 1].
+        plain: draws (M',) of the posterior that takes the model for right, where that is another.
     """
     point = bool(np.ptp(theta) < _POINT)
     low, high = view_with((0.0, 1.0) if point else view(theta, default), truth)
@@ -144,6 +146,9 @@ def marginal(
         ax.fill_between(x, height, where=within.tolist(), color=POSTERIOR, alpha=STYLE.interval, lw=0)
         ax.plot(x, height, color=POSTERIOR, lw=STYLE.curve)
         ax.set_ylim(0, 1.08 * height.max())
+        if plain is not None and np.ptp(plain) >= _POINT:
+            narrow = density(plain, grid)
+            ax.plot(x, narrow * height.max() / narrow.max(), color=POSTERIOR, lw=STYLE.reference, ls=":")
     if default is not None and low <= default <= high:
         ax.axvline(parameter.value(default), color=DEFAULT, ls="--", lw=STYLE.reference)
     if truth is not None:
@@ -164,7 +169,12 @@ def reference_handles(known: Sequence[Place], default_mark: str = "", truth_mark
 
 
 def marginal_grid(
-    parameters: Sequence[Parameter], theta: FloatArray, prior: Posterior, intervals: FloatArray, truth: Sequence[Place]
+    parameters: Sequence[Parameter],
+    theta: FloatArray,
+    prior: Posterior,
+    intervals: FloatArray,
+    truth: Sequence[Place],
+    plain: FloatArray | None = None,
 ) -> Figure:
     """A ``marginal`` of each of K parameters, with a legend.
 
@@ -174,12 +184,15 @@ def marginal_grid(
         prior: of these and perhaps others.
         intervals: the ends of the 90 % intervals in theta (2, K).
         truth: in theta (K,).
+        plain: draws of the posterior that takes the model for right (M', K), where that is another: dotted, as high.
     """
     figure, axes, _ = panel_grid(len(parameters), 1.85, 0.4)
-    for ax, parameter, column, interval, known in zip(axes, parameters, theta.T, intervals.T, truth, strict=True):
+    for j, (ax, parameter) in enumerate(zip(axes, parameters, strict=True)):
         default = None if parameter.default is None else float(parameter.normalise(parameter.default))
-        marginal(ax, parameter, column, prior, interval, default, known)
+        narrow = None if plain is None else plain[:, j]
+        marginal(ax, parameter, theta[:, j], prior, intervals[:, j], default, truth[j], narrow)
     shown = [line_handle(POSTERIOR, "posterior"), shade_handle(POSTERIOR, "90 % interval")]
+    shown += [line_handle(POSTERIOR, "if the model lacked nothing", ":")] * (plain is not None)
     legend_above(figure, [*shown, *reference_handles(truth)], 5)
     return figure
 

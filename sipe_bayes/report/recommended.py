@@ -22,7 +22,6 @@ from sipe_bayes.report.verdicts import doubt, parameter_verdict
 from sipe_bayes.rl.randomization import Usable
 
 _DRAWS = 4000  # of a posterior some of whose parameters may not be used
-_ENDS = (0.05, 0.95)  # of the intervals that are printed
 
 
 @dataclass(frozen=True)
@@ -82,28 +81,12 @@ def recommended(calibration: Calibration) -> Recommended:
         usable = Usable.NONE if blocked or verdict.tone == "bad" else printed
         bases[parameter.name] = Basis(usable, blocked or verdict.text)
     unusable = np.array([basis.usable is Usable.NONE for basis in bases.values()])
-    posterior = calibration.posterior
-    if calibration.further is not None:
-        posterior = _stretched(calibration, calibration.further)
+    posterior = calibration.posterior if calibration.further is None else calibration.further
     if unusable.all():
         posterior = calibration.prior
     elif unusable.any():
         posterior = _freed(posterior, calibration.prior, unusable)
     return Recommended(posterior, bases)
-
-
-def _stretched(calibration: Calibration, further: Particles) -> Particles:
-    """Theta with what the model lacks, each parameter mapped so that the printed ends are its 5 and 95 % quantiles.
-
-    These hold the plain ones, which theta with what the model lacks need not.
-    """
-    theta, space = further.theta.numpy().copy(), further.space
-    ends = further.quantile(torch.tensor(_ENDS, dtype=torch.float64)).numpy()
-    for j, parameter in enumerate(calibration.parameters):
-        if parameter.further is not None:
-            low, high = (min(max(space[j].normalise(value), 0.0), 1.0) for value in parameter.further)
-            theta[:, j] = np.interp(theta[:, j], [0.0, *ends[:, j], 1.0], [0.0, low, high, 1.0])
-    return Particles(theta, space, weights=further.weights)
 
 
 def _freed(posterior: Posterior, prior: Posterior, unusable: BoolArray) -> Particles:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.simulation.simulator import Simulator
@@ -115,21 +115,41 @@ def _touching(model: mujoco.MjModel, logs: Sequence[FloatArray]) -> tuple[Counte
     now = _spread(len(states))
     before = np.maximum(now - 1, first[now])
     finite = np.isfinite(states[now]).all(1) & np.isfinite(states[before]).all(1)
-    all_known, now, before = bool(finite.all()), now[finite], before[finite]
-    near, data, seen = copy.copy(model), mujoco.MjData(model), Counter[tuple[int, int]]()
+    pairs = _pairs(model, states, before[finite], now[finite])
+    return Counter(pair for own in pairs for pair in own), int(finite.sum()), bool(finite.all())
+
+
+def apart_along(simulator: Simulator | CallableSimulator, log: FloatArray) -> BoolArray:
+    """At which of the states (T+1, S) along a log nothing touches or may do so, as in those that are not known."""
+    if isinstance(simulator, CallableSimulator) or not may_touch(simulator.model):
+        return np.ones(len(log), bool)
+    states = log[:, 1 : 1 + simulator.model.nq]
+    now = np.arange(len(log))
+    before = np.maximum(now - 1, 0)
+    finite = np.isfinite(states[now]).all(1) & np.isfinite(states[before]).all(1)
+    out = np.zeros(len(log), bool)
+    out[finite] = [not pairs for pairs in _pairs(simulator.model, states, before[finite], now[finite])]
+    return out
+
+
+def _pairs(model: mujoco.MjModel, states: FloatArray, before: IntArray, now: IntArray) -> list[set[tuple[int, int]]]:
+    """The geoms that touch at some of the positions (n, nq) along logs, given the numbers of those before."""
+    near, data = copy.copy(model), mujoco.MjData(model)
     reach = 2 * max((_step(model, data, states[b], states[n]) for b, n in zip(before, now, strict=True)), default=0.0)
     near.geom_margin[:], near.geom_gap[:] = model.geom_margin + reach, 0.0
     near.pair_margin[:], near.pair_gap[:] = model.pair_margin + reach, 0.0
-    last, distances = -1, dict[tuple[int, int], float]()
+    out, last, distances = list[set[tuple[int, int]]](), -1, dict[tuple[int, int], float]()
     for b, n in zip(before.tolist(), now.tolist(), strict=True):
         earlier = distances if b == last else _distances(near, data, states[b])
         last, distances = n, _distances(near, data, states[n])
+        seen = set[tuple[int, int]]()
         for pair, distance in distances.items():
             margin = float(model.geom_margin[list(pair)].max())
             ahead = 2 * distance - earlier.get(pair, math.inf) if b < n else distance
             if distance <= margin or (math.isfinite(ahead) and ahead <= 0):
-                seen[pair] += 1
-    return seen, len(now), all_known
+                seen.add(pair)
+        out.append(seen)
+    return out
 
 
 def _step(model: mujoco.MjModel, data: mujoco.MjData, before: FloatArray, now: FloatArray) -> float:

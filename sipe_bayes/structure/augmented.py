@@ -47,6 +47,8 @@ class AugmentedOptions(Options):
     """How much is simulated."""
 
     simulated_steps: float = option(1e6, "physics steps of all probes together, about", above=0)
+    hides: float = option(1.4, "of the samples' scatter: from here on noise hides as much again", above=1)
+    rounding: float = option(2.0, "of the simulation's rounding, below which noise is that", least=1)
     steps: int = option(4000, "of windows spread evenly over long logs: each probe is a simulation", "control steps")
 
 
@@ -165,17 +167,29 @@ class AugmentedModel:
         noise = windows.estimate_noise(windows.moments(lin), before, pulls, self.coloured)
         return Noise(np.maximum(noise.sd, windows.rounding), noise.tau)
 
-    def fitted(self, columns: IntArray) -> Fitted:
-        """The log-likelihood with some probes (J,) of any size, at the noise that is best with them."""
+    @property
+    def scatter(self) -> Noise | None:
+        """White noise of the samples' scatter in channels whose fit takes far more for noise; None without such."""
+        noise, scatter = self.noise, self.windows.level.sd
+        rests = scatter < AUGMENTED.rounding * self.windows.rounding
+        holds = (scatter * AUGMENTED.hides < noise.sd) & ~rests
+        return Noise(np.where(holds, scatter, noise.sd), np.where(holds, 0.0, noise.tau)) if holds.any() else None
+
+    def fitted(self, columns: IntArray, before: Noise | None = None) -> Fitted:
+        """The log-likelihood with some probes (J,) of any size, at the noise that is best with them.
+
+        before: from which that noise is searched; default the fit's.
+        """
+        before = self.noise if before is None else before
         n, windows = self.windows.num_theta, self.windows
         every = np.concatenate([np.arange(n), n + columns, np.arange(self.count, self.jacobian.shape[-1])])
         moments = windows.moments(Linearisation(self.residual, self.jacobian[..., every], True))
-        normal, count = moments.normal(self.noise), n + len(columns)
+        normal, count = moments.normal(before), n + len(columns)
         precision, pull = np.zeros((count, count)), np.zeros(count)
         precision[:n, :n], pull[:n] = self.inner, self.pull
         # probes of no size of their own, so that the information exists
         precision[n:, n:] = _FAINT * np.diag(np.diag(normal.sum(0))[n:count])
-        noise = windows.estimate_noise(moments, self.noise, windows.pulls(precision, pull, self.starts), True)
+        noise = windows.estimate_noise(moments, before, windows.pulls(precision, pull, self.starts), True)
         normal = moments.normal(noise)
         arrow = windows.eliminate(normal, count, self.starts)
         total = arrow.gradient + pull

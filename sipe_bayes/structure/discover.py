@@ -29,6 +29,8 @@ from sipe_bayes.structure.search import StructureSearch
 from sipe_bayes.structure.state import BUDGET, DiscoverOptions, DiscoverState, Phase
 from sipe_bayes.structure.structures import Structures
 
+FEWEST_APART = 4  # windows or spans in which nothing touches, without which nothing is asked of logs with impacts
+LEAST_SPAN = 10  # control steps of such a span
 _SAVE_SECONDS = 1.0
 
 
@@ -95,7 +97,7 @@ def discover(
 
     Args:
         simulator: of an ``MjcfEnvironment``, the user's model with its unknowns.
-        trajectories: the logs.
+        trajectories: the logs; where bodies strike along them, the spans in which nothing touches are searched.
         holdout: logs that no structure is fitted to; they count as held-out pieces do.
         prior: of the unknowns; default their own.
         likelihood: how logs are cut into windows; the noise is coloured whatever it says.
@@ -110,7 +112,7 @@ def discover(
 
     Raises:
         ValueError: for a simulator of anything but an MJCF, unknown extensions, sites that the model does not have, or
-            logs through impacts.
+            logs in which bodies touch nearly all along.
         CheckpointError: for a checkpoint that is damaged or of another run.
         SearchInterrupted: with what the search has, where it is interrupted.
     """
@@ -209,13 +211,25 @@ def _search(
         whole("seed", seed, 0),
         simulator.num_threads or cores(),
     )
-    if fitting.windows(simulator).impacts:
-        raise ValueError(
-            "logs: bodies strike or slip along them, and fits of two structures through impacts do not compare; add "
-            "what you suspect as parameters, fit with likelihood = 'state_space', and compare the held-out errors"
-        )
+    windows = fitting.windows(simulator)
+    if windows.impacts:
+        free = between_contacts(windows)
+        held = None if holdout is None else between_contacts(BoundLikelihood(fitting.likelihood, simulator, holdout))
+        if free is None or any(parameter.log is not None for parameter in environment.parameters):
+            raise ValueError(
+                "logs: bodies touch nearly all along them, and fits of two structures through impacts do not compare; "
+                "add what you suspect as parameters, fit with likelihood = 'state_space', and compare held-out errors"
+            )
+        whole_spans = replace(fitting.likelihood, window=None, windows=())
+        fitting = replace(fitting, trajectories=free, holdout=held, likelihood=whole_spans)
     most = whole("budget", budget, 1, "rollouts", MOST_ROLLOUTS)
     return StructureSearch(fitting, extensions, restriction.sites, options, most, progress, restriction.finer)
+
+
+def between_contacts(windows: BoundLikelihood) -> Trajectories | None:
+    """The spans of logs in which nothing touches; None of hardly any."""
+    spans = windows.spans_apart(LEAST_SPAN)
+    return Trajectories.stack(spans) if len(spans) >= FEWEST_APART else None
 
 
 def _check_sites(environment: MjcfEnvironment, sites: Sequence[str] | None) -> None:

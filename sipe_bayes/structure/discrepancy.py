@@ -19,6 +19,8 @@ integrated by its evidence, so that the interval widens as evidence grows and no
 Deviations:
 
 - The noise is estimated anew with the effects that are seen, in turns: what a model lacks made it larger and slower.
+  Where the fit takes far more for noise than samples scatter by, turns begin at that scatter as well, and what ends at
+  the higher likelihood counts: slow noise passes for slow forces.
 - Columns that theta imitates but for ``imitated`` of their information are not asked of the logs: at that level the
   linearisation of dry friction is no better. With a tolerance they keep it, without one they are left out.
 - How much of what is moved to first order is moved in truth is normal around all of it, of sd ``reach``, and not
@@ -40,7 +42,7 @@ import torch
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.diagnostics.agreement import LogEstimate, parts_of
-from sipe_bayes.likelihood import UNIFORM_PRECISION
+from sipe_bayes.likelihood import UNIFORM_PRECISION, Noise
 from sipe_bayes.posterior import GaussianMixture, Particles, Posterior
 from sipe_bayes.structure.augmented import AtNoise, AugmentedModel
 from sipe_bayes.structure.physics_step import PHYSICS_STEP
@@ -49,6 +51,7 @@ from sipe_bayes.structure.single_effects import EFFECTS, Columns, Effects, find_
 from sipe_bayes.structure.tolerances import EXACT, Tolerances
 
 _NOTHING = 1e-150  # information of a column that moves nothing: its square is no number
+_ENDS = (0.05, 0.95)  # of the intervals that are printed
 _SAME = 1e-3  # of a column's information: what is left of it beside a number with a tolerance that is the same
 
 
@@ -87,7 +90,7 @@ class Discrepancy:
     tolerances: Tolerances = EXACT
 
     def draw(self, posterior: Posterior, seed: int) -> Particles:
-        """Theta, from a posterior that takes the model for right."""
+        """Theta, from a posterior that takes the model for right, whose 90 % intervals lie within."""
         random, logs, made = np.random.default_rng(seed), self.at.logs, self.at.projected
         count = DISCREPANCY.draws
         single, every = np.zeros((2, count, len(logs.probes)))
@@ -99,7 +102,7 @@ class Discrepancy:
         share = np.maximum(1 + DISCREPANCY.reach * random.standard_normal((count, 1)), 0.0)
         released = made.base - logs.seen.projected.base  # of parameters that come away from their bounds
         moved = released + share * (logs.traded(single) - sizes @ made.answer.T)
-        return Particles(np.clip(self._stretched(posterior, random) + moved, 0, 1), posterior.space)
+        return _holding(self._stretched(posterior, random) + moved, posterior)
 
     def _stretched(self, posterior: Posterior, random: np.random.Generator) -> FloatArray:
         """Draws (M, N) of a posterior, stretched by what samples tell less and by what logs differ."""
@@ -165,7 +168,17 @@ def draw_differing(posterior: Posterior, logs: Sequence[LogEstimate], seed: int)
     generator = torch.Generator().manual_seed(int(random.integers(2**31)))
     theta = posterior.sample((len(apart),), generator=generator).numpy()
     theta = theta + apart * posterior.stddev.numpy() * random.standard_normal(theta.shape)
-    return Particles(np.clip(theta, 0, 1), posterior.space)
+    return _holding(theta, posterior)
+
+
+def _holding(theta: FloatArray, posterior: Posterior) -> Particles:
+    """Draws (M, N), each parameter's mapped so that its 90 % interval holds the posterior's."""
+    theta = np.clip(theta, 0, 1)
+    inner = posterior.quantile(torch.tensor(_ENDS, dtype=torch.float64)).numpy()
+    for j, (low, high) in enumerate(inner.T):
+        own = np.quantile(theta[:, j], _ENDS)
+        theta[:, j] = np.interp(theta[:, j], [0.0, *own, 1.0], [0.0, min(low, own[0]), max(high, own[1]), 1.0])
+    return Particles(theta, posterior.space)
 
 
 def find_discrepancy(logs: AugmentedModel, tolerances: Tolerances = EXACT) -> Discrepancy:
@@ -175,8 +188,16 @@ def find_discrepancy(logs: AugmentedModel, tolerances: Tolerances = EXACT) -> Di
         logs: the linear model at an estimate.
         tolerances: of numbers that no machine has exactly.
     """
-    at, sds = logs.seen, np.array([tolerances.of(probe) * probe.whole for probe in logs.probes])
+    sds = np.array([tolerances.of(probe) * probe.whole for probe in logs.probes])
     sds = np.where(np.isfinite(sds), sds, 0.0)
+    noises = [logs.noise, *([] if logs.scatter is None else [logs.scatter])]
+    told, usable, effects = max((_explained(logs, noise, sds) for noise in noises), key=lambda one: _level(*one))
+    return Discrepancy(told, usable, effects, Known.of(told, sds), Spread.of(told), tolerances)
+
+
+def _explained(logs: AugmentedModel, noise: Noise, sds: FloatArray) -> tuple[AtNoise, IntArray, Effects | None]:
+    """Effects and the noise that they leave, in turns from a noise on; the probes that were asked for."""
+    at = logs.seen if noise is logs.noise else AtNoise(logs, noise)
     for _ in range(DISCREPANCY.rounds):
         before, told = at.sizes, at.discounted
         usable, effects = _effects(told, sds)
@@ -186,8 +207,15 @@ def find_discrepancy(logs: AugmentedModel, tolerances: Tolerances = EXACT) -> Di
         if not (sizes.any() or before.any()):
             break
         at = AtNoise(logs, logs.estimate_noise(at.noise, sizes), sizes)
-    told = AtNoise(logs, told.noise, sizes)
-    return Discrepancy(told, usable, effects, Known.of(told, sds), Spread.of(told), tolerances)
+    return AtNoise(logs, told.noise, sizes), usable, effects
+
+
+def _level(at: AtNoise, usable: IntArray, effects: Effects | None) -> float:
+    """The log-likelihood with effects that are more likely at work than not, less what is against each beforehand."""
+    seen = [] if effects is None else [effect for effect in effects.single if effect.present > 0.5]
+    columns = usable[[int(effect.by_column.argmax()) for effect in seen]]
+    against = sum(effect.against for effect in seen)
+    return at.logs.fitted(columns.astype(int), at.noise).level - against
 
 
 def asked(at: AtNoise) -> BoolArray:

@@ -125,6 +125,12 @@ class SingleEffect:
         return float(self.weights.sum())
 
     @property
+    def against(self) -> float:
+        """Nats that are against its likeliest column beforehand, rather than none."""
+        parts = self.columns.parts[int(self.by_column.argmax())]
+        return float(np.log(EFFECTS.absent / ((1 - EFFECTS.absent) * parts)))
+
+    @property
     def by_column(self) -> FloatArray:
         """(K,) that it is which."""
         return np.asarray(self.weights.sum(0))

@@ -83,25 +83,56 @@ def paced(monkeypatch: pytest.MonkeyPatch, *done: tuple[int, float]) -> list[str
     return shown
 
 
-@pytest.mark.parametrize(
-    "during", ["sipe_bayes.structure.search.StructureSearch._prune", "sipe_bayes.calibration.discover.summarise"]
-)
-def test_an_interruption_says_what_there_is(
-    during: str, config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Which is gone on from: dry friction is fitted and kept before the others are asked once more, and after all."""
+def interrupted(config: Path, during: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command, which ends as what was interrupted does."""
     words = ["sipe", "discover", str(config), "--threads", "1", "--out", str(config.parent / "o")]
     monkeypatch.setattr("sys.argv", words)
     monkeypatch.setattr(during, _interrupted)
     with pytest.raises(SystemExit) as left:
         main()
     assert left.value.code == 130
+
+
+def test_an_interrupted_search_answers_with_what_it_has(
+    config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Dry friction is fitted and kept before the others are asked once more; report, table and model are written."""
+    interrupted(config, "sipe_bayes.structure.search.StructureSearch._prune", monkeypatch)
+    shown = capsys.readouterr().out
+    assert "dry friction at hinge" in shown
+    assert "the search ended when it was interrupted" in " ".join(shown.split())
+    folder = config.parent / "o"
+    assert {"report.html", "structures.json", "discovered.xml"} <= {file.name for file in folder.iterdir()}
+    monkeypatch.undo()
+    monkeypatch.setattr("sys.argv", ["sipe", "discover", str(config), "--threads", "1", "--out", str(folder)])
+    with pytest.raises(SystemExit, match="0"):
+        main()
+    assert "interrupted" not in capsys.readouterr().out
+
+
+def test_who_interrupts_again_is_told_what_there_is(
+    config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    interrupted(config, "sipe_bayes.calibration.discover.summarise", monkeypatch)
     errors = capsys.readouterr().err
     size = r"\(joint:hinge.frictionloss 0.1\d* N m\)"
     assert re.search(
         rf"interrupted: \d+ structures fitted, the best so far dry_friction:hinge {size}, \d\d+ nats", errors
     )
     assert errors.rstrip().endswith("over the model as it was; the same command goes on")
+
+
+def test_a_time_limit_ends_a_search_with_what_it_has(
+    config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No time at all: the model as it is is fitted, nothing more."""
+    words = ["sipe", "discover", str(config), "--threads", "1", "--out", str(config.parent / "o"), "--time-limit", "0"]
+    monkeypatch.setattr("sys.argv", words)
+    with pytest.raises(SystemExit, match="0"):
+        main()
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "the search ended at its time limit before any piece was tried" in shown
+    assert "give a longer --time-limit, and the same folder goes on" in shown
 
 
 def _interrupted(*_: object) -> None:

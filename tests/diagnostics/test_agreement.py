@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from sipe_bayes.inference.random_effects import LogEstimate
 
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.agreement import disagreement, log_estimates
+from sipe_bayes.diagnostics.agreement import LogEstimate, disagreement, log_estimates
 from sipe_bayes.likelihood import Segments
 from tests.problems.pendulums import log, pendulum
 

@@ -21,7 +21,13 @@ LAW = piece("stribeck", kept=True, native=False, nearest="LuGre", parameters=("h
 TWIN = row("drag at hinge", weight=0.4, behind=4.0)
 GAINS = piece("gain", "motor", kept=True, parameters=tuple(f"motor.gain[{k}]" for k in range(6)))
 
-CUT = finding(Code.STRUCTURES_CUT_SHORT, budget=30000, larger=60000, before="any piece was tried", untried="")
+CUT = finding(
+    Code.STRUCTURES_CUT_SHORT,
+    why="with its budget of 30000 rollouts",
+    before="any piece was tried",
+    untried="",
+    remedy="give --budget 60000",
+)
 
 
 def changed(*pieces: Any, **changes: Any) -> Discovery:

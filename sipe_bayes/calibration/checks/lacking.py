@@ -24,6 +24,7 @@ from sipe_bayes.inference.recorded import Tell
 from sipe_bayes.likelihood import QuadraticPrior, StateSpace
 from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.structure.augmented import AugmentedModel
+from sipe_bayes.structure.discover import FEWEST_APART
 from sipe_bayes.structure.discrepancy import Discrepancy, draw_differing, find_discrepancy
 from sipe_bayes.structure.physics_step import PHYSICS_STEP
 
@@ -103,12 +104,15 @@ def _found(problem: Problem, fit: Fit, unknown: list[Finding], tell: Tell, kept:
     if left < THRESHOLDS.rounding:
         unknown.append(finding(Code.NOISE_FREE, share=left))
         return None
+    some, lin = fit.some, fit.lin
     if fit.windows.impacts:
-        unknown.append(finding(Code.MISFIT_NOT_ASKED))
-        return None
-    windows, starts, prior = fit.windows.part(fit.some), fit.starts[fit.some], QuadraticPrior.of(problem.prior)
+        some, lin = some[fit.windows.apart[some]], None
+        if len(some) < FEWEST_APART:
+            unknown.append(finding(Code.MISFIT_NOT_ASKED))
+            return None
+    windows, starts, prior = fit.windows.part(some), fit.starts[some], QuadraticPrior.of(problem.prior)
     try:
-        logs = AugmentedModel(windows, fit.theta, fit.noise, starts, prior, fit.lin, tell, kept)
+        logs = AugmentedModel(windows, fit.theta, fit.noise, starts, prior, lin, tell, kept)
         if logs.windows.num_windows < fit.windows.num_windows:
             asked, every = logs.windows.num_windows, fit.windows.num_windows
             unknown.append(finding(Code.CHECKS_THINNED, asked=asked, windows=every))

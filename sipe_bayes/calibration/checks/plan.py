@@ -114,7 +114,7 @@ def plan_of(problem: Problem, method: Estimator) -> Plan:
 
     search = starts_cost(windows)
     try:
-        placed = [] if chain or windows.impacts else place_extensions(windows, theta, windows.no_starts())
+        placed = [] if chain else place_extensions(windows, theta, windows.no_starts())
         lacking = round(probes_cost(windows, placed) * share(steps_of(windows, placed)))
     except ValueError:  # the model as given diverges, which the check will say
         lacking = 0
@@ -122,7 +122,7 @@ def plan_of(problem: Problem, method: Estimator) -> Plan:
     return {
         Check.STARTS: 0 if known else 2 * search,
         Check.LOGS: (alone if chain else round(lin * share(LOOKED_AT))) if logs > 1 and not windows.impacts else 0,
-        Check.LACKING: 0 if chain or windows.impacts else lacking + logs,
+        Check.LACKING: 0 if chain else lacking + logs,
         Check.PREDICTIONS: 2 * (logs + held),
         Check.COMPARISON: round(search * share(LOOKED_AT) * (logs + held)) // logs,
         Check.PRIOR: round(PREDICTIVE.simulations * logs * share(PREDICTIVE.steps)),
