@@ -107,7 +107,7 @@ def test_an_interrupted_search_answers_with_what_it_has(
     monkeypatch.setattr("sys.argv", ["sipe", "discover", str(config), "--threads", "1", "--out", str(folder)])
     with pytest.raises(SystemExit, match="0"):
         main()
-    assert "interrupted" not in capsys.readouterr().out
+    assert "when it was interrupted" not in capsys.readouterr().out
 
 
 def test_who_interrupts_again_is_told_what_there_is(

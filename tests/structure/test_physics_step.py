@@ -155,7 +155,7 @@ def test_what_steps_do_is_taken_back_once() -> None:
     whole = -logs.seen.projected.answer[:, k] * logs.probes[k].whole / sd
     print(shift, whole, (values - plain) / sd)
     assert whole[1] > 1.2
-    np.testing.assert_allclose(shift, whole, atol=0.6)
+    np.testing.assert_allclose(shift, whole, atol=0.8)
 
 
 def test_a_step_of_which_the_logs_tell_is_not_untold() -> None:
