@@ -17,6 +17,7 @@ from sipe_bayes.calibration.checks.lacking import NOTHING_ASKED, Lacking, lackin
 from sipe_bayes.calibration.checks.plan import NO_PLAN, Check, Checks, plan_of, rollouts_of, with_checks
 from sipe_bayes.calibration.checks.predictions import Compared, Place, Predictions, every_channel, place_in_prior
 from sipe_bayes.calibration.checks.ranges import ranges_that_change_nothing
+from sipe_bayes.calibration.force_scale import find_open_scale
 from sipe_bayes.calibration.gathered import (
     Marginals,
     most_probable,
@@ -78,7 +79,7 @@ def calibrate(
         time_limit: s, after which the search ends with its best estimate and checks are skipped; default none. The
             same call with another limit resumes.
         keep: called with the result of the fit alone, as soon as there is one.
-        announce: called with a first estimate in words, long before that.
+        announce: called with a question that a fit cannot answer, and with a first estimate in words, long before that.
     """
     began = time.monotonic()
     method = method_of(problem, estimator, seed, budget, checkpoint, progress)
@@ -88,6 +89,13 @@ def calibrate(
     if progress is not None:
         plan = guard.run("forecast", lambda: plan_of(problem, method)).otherwise(plan)
         method.progress = with_checks(progress, plan, method, len(problem.train))
+    if announce is not None:
+        ask = guard.run("scale of the forces", lambda: find_open_scale(problem)).otherwise(())
+        if ask:
+            announce(
+                f"no motion tells how large {', '.join(ask)} are together: all can grow by a tenth and every motion is "
+                "the same; fix one of them at a measured value, such as a weighed mass, or read them as ratios"
+            )
     posterior = method.fit(problem.train)
     model, space = problem.simulator.model, problem.environment.space
     marginals = guard.run(

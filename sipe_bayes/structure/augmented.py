@@ -46,7 +46,7 @@ _PRESSED = 1e-6  # of the range: a parameter that the search left on its bound
 class AugmentedOptions(Options):
     """How much is simulated."""
 
-    simulated_steps: float = option(1e6, "physics steps of all probes together, about", above=0)
+    simulated_steps: float = option(5e5, "physics steps of all probes together, about", above=0)
     hides: float = option(1.4, "of the samples' scatter: from here on noise hides as much again", above=1)
     rounding: float = option(2.0, "of the simulation's rounding, below which noise is that", least=1)
     steps: int = option(4000, "of windows spread evenly over long logs: each probe is a simulation", "control steps")
