@@ -252,7 +252,7 @@ def print_calibration(calibration: Calibration) -> None:
     sentences = verdicts(calibration, brief=True)
     for verdict in sentences[:_SENTENCES]:
         console.print(Text(verdict.text, style=_TONES[verdict.tone]))
-    below = [*_pooled(calibration), *_worst(findings, calibration.out)]
+    below = [*_pooled(calibration), *_worst(findings, calibration.out), *_drawn_from_prior(calibration)]
     below.append(f"{calibration.rollouts} rollouts, {calibration.seconds:.1f} s" + _report(calibration))
     _print_parameters(console, calibration, findings, _LINES - 1 - min(len(sentences), _SENTENCES) - len(below))
     for line in below:
@@ -333,6 +333,17 @@ def _worst(findings: Findings, out: str) -> list[str]:
     shown = [*(item for item in findings if item.text in kinds[:_WARNINGS]), *untold]
     where = shlex.quote(out) if out else " ".join(dict.fromkeys(str(item.code) for item in shown))
     return lines + [f"what these mean and what to do: sipe explain {where}"] * bool(lines)
+
+
+def _drawn_from_prior(calibration: Calibration) -> list[str]:
+    """What the file that randomises a simulation does not have from the calibration, if anything."""
+    from sipe_bayes.report.recommended import recommended
+    from sipe_bayes.report.words import listed
+    from sipe_bayes.rl.randomization import Usable
+
+    names = recommended(calibration).names(Usable.NONE) if calibration.out else ()
+    whose = "every parameter" if len(names) == len(calibration.parameters) else listed(list(names))
+    return [f"domain_randomization.json holds the prior of {whose}, for no interval may be used"] if names else []
 
 
 def _report(calibration: Calibration) -> str:

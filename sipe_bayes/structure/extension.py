@@ -25,7 +25,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -50,12 +50,12 @@ class Extension(ABC):
     ``kind`` says what it is placed at. ``reference`` says where it is described.
     """
 
-    name: ClassVar[str]
-    kind: ClassVar[Kind]
-    reference: ClassVar[str]
-    native: ClassVar[bool] = True  # MJCF has an element for it
-    nearest: ClassVar[str] = ""  # the element of MJCF that comes nearest, where it has none of its own
-    last_resort: ClassVar[bool] = False  # tried only where nothing else helps
+    name: str
+    kind: Kind
+    reference: str
+    native: bool = True  # MJCF has an element for it
+    nearest: str = ""  # the element of MJCF that comes nearest, where it has none of its own
+    last_resort: bool = False  # tried only where nothing else helps
 
     @abstractmethod
     def sentence(self, site: str) -> str:

@@ -15,38 +15,39 @@ from pathlib import Path
 
 from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.structure.extension import KINDS, Extension
+from sipe_bayes.structure.extensions.table import ROWS
 
 _PACKAGE = "sipe_bayes.structure.extensions"
-EXTENSIONS: dict[str, str] = {  # name: module and class
-    "viscous_friction": "joint:ViscousFriction",
-    "dry_friction": "joint:DryFriction",
-    "armature": "joint:Armature",
-    "quadratic_damping": "joint:QuadraticDamping",
-    "cubic_damping": "joint:CubicDamping",
-    "spring": "joint:Spring",
-    "hardening_spring": "joint:HardeningSpring",
-    "direction_friction": "joint:DirectionFriction",
-    "stribeck": "joint:Stribeck",
-    "presliding": "joint:Presliding",
-    "hysteresis": "joint:Hysteresis",
+EXTENSIONS: dict[str, str] = {  # name: the table, or module and class
+    "viscous_friction": "table",
+    "dry_friction": "table",
+    "armature": "table",
+    "quadratic_damping": "table",
+    "cubic_damping": "table",
+    "spring": "table",
+    "hardening_spring": "table",
+    "direction_friction": "table",
+    "stribeck": "table",
+    "presliding": "table",
+    "hysteresis": "table",
     "gear_compliance": "elastic:GearCompliance",
     "link_compliance": "elastic:LinkCompliance",
     "gear_backlash": "elastic:GearBacklash",
     "link_backlash": "elastic:LinkBacklash",
-    "load_friction": "joint:LoadFriction",
-    "tendon_viscous_friction": "tendon:TendonViscousFriction",
-    "tendon_dry_friction": "tendon:TendonDryFriction",
-    "tendon_spring": "tendon:TendonSpring",
-    "delay": "actuator:Delay",
+    "load_friction": "table",
+    "tendon_viscous_friction": "table",
+    "tendon_dry_friction": "table",
+    "tendon_spring": "table",
+    "delay": "table",
     "lag": "actuator:Lag",
-    "offset": "actuator:Offset",
-    "back_emf": "actuator:BackEmf",
-    "force_limit": "actuator:ForceLimit",
-    "command_limit": "actuator:CommandLimit",
-    "force_drop": "actuator:ForceDrop",
-    "direction_gain": "actuator:DirectionGain",
-    "power": "actuator:Power",
-    "dead_zone": "actuator:DeadZone",
+    "offset": "table",
+    "back_emf": "table",
+    "force_limit": "table",
+    "command_limit": "table",
+    "force_drop": "table",
+    "direction_gain": "table",
+    "power": "table",
+    "dead_zone": "table",
     "cogging": "actuator:Cogging",
     "gain": "actuator:Gain",
     "log_gain": "actuator:LogGain",
@@ -73,6 +74,8 @@ def get_extension(name: str) -> Extension:
     """
     if name in EXTENSIONS:
         module, _, kind = EXTENSIONS[name].partition(":")
+        if not kind:
+            return ROWS[name]
         return _made(f"{_PACKAGE}.{module}", kind, name)
     module, _, kind = name.rpartition(":")
     if not module:

@@ -218,6 +218,7 @@ def test_the_spread_of_a_search_is_not_trusted(tmp_path: Path, log: pd.DataFrame
     config = write_case(tmp_path, log)
     result = call(config, "--estimator", "cem", "--budget", 200, "--out", tmp_path / "out")
     assert result.exit_code == NOTHING_USABLE, result.stderr
+    assert "domain_randomization.json holds the prior of every parameter" in " ".join(result.stdout.split())
     assert "interval yet: " in result.stdout
     assert "warning: the spread of cem" in " ".join(result.stdout.split())
     found = strict_json((tmp_path / "out" / "result.json").read_text())
