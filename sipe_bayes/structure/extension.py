@@ -1,8 +1,9 @@
 """What a model may get: an extension is a piece of physics with parameters of its own, placed at a joint or elsewhere.
 
-It reduces to the plain model where its parameters have the model's own values, their defaults. To add one, write a file
-with a subclass of ``Extension`` and a line in ``structure.registry.EXTENSIONS``; one of your own, outside this package,
-is named by its import path. The simplest::
+It reduces to the plain model where its parameters have the model's own values, their defaults. To add one
+that needs no more than parameters, write a row of ``structure.extensions.table``. Another one is a subclass of
+``Extension``, with a line in ``structure.registry``; one of your own, outside this package, is named by its import
+path. The simplest::
 
     from sipe_bayes.core.parameters import Parameter
     from sipe_bayes.structure.extension import Extension

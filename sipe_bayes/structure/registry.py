@@ -18,36 +18,12 @@ from sipe_bayes.structure.extension import KINDS, Extension
 from sipe_bayes.structure.extensions.table import ROWS
 
 _PACKAGE = "sipe_bayes.structure.extensions"
-EXTENSIONS: dict[str, str] = {  # name: the table, or module and class
-    "viscous_friction": "table",
-    "dry_friction": "table",
-    "armature": "table",
-    "quadratic_damping": "table",
-    "cubic_damping": "table",
-    "spring": "table",
-    "hardening_spring": "table",
-    "direction_friction": "table",
-    "stribeck": "table",
-    "presliding": "table",
-    "hysteresis": "table",
+_CLASSES = {  # name: module and class
     "gear_compliance": "elastic:GearCompliance",
     "link_compliance": "elastic:LinkCompliance",
     "gear_backlash": "elastic:GearBacklash",
     "link_backlash": "elastic:LinkBacklash",
-    "load_friction": "table",
-    "tendon_viscous_friction": "table",
-    "tendon_dry_friction": "table",
-    "tendon_spring": "table",
-    "delay": "table",
     "lag": "actuator:Lag",
-    "offset": "table",
-    "back_emf": "table",
-    "force_limit": "table",
-    "command_limit": "table",
-    "force_drop": "table",
-    "direction_gain": "table",
-    "power": "table",
-    "dead_zone": "table",
     "cogging": "actuator:Cogging",
     "gain": "actuator:Gain",
     "log_gain": "actuator:LogGain",
@@ -64,6 +40,8 @@ EXTENSIONS: dict[str, str] = {  # name: the table, or module and class
     "medium_drag": "world:MediumDrag",
     "residual": "world:Residual",
 }
+EXTENSIONS = (*ROWS, *_CLASSES)
+"""Names, those of the table first."""
 
 
 def get_extension(name: str) -> Extension:
@@ -72,10 +50,10 @@ def get_extension(name: str) -> Extension:
     Raises:
         ValueError: for a name that is neither; one line with the remedy.
     """
-    if name in EXTENSIONS:
-        module, _, kind = EXTENSIONS[name].partition(":")
-        if not kind:
-            return ROWS[name]
+    if name in ROWS:
+        return ROWS[name]
+    if name in _CLASSES:
+        module, _, kind = _CLASSES[name].partition(":")
         return _made(f"{_PACKAGE}.{module}", kind, name)
     module, _, kind = name.rpartition(":")
     if not module:
