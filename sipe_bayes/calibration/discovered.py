@@ -45,7 +45,8 @@ def write_discovery(discovery: Discovery, structures: Structures, problem: Probl
     discovery = replace(discovery, findings=(*discovery.findings, *noticed))
     write_discovery_report(discovery, folder)
     write_text(folder / STRUCTURES, to_json(discovery.to_dict(), indent=2))
-    write_text(folder / RUN, to_json({**discovery.run, "status": "complete"}, indent=2))
+    status = "interrupted" if discovery.ended in ("time", "interrupted") else "complete"
+    write_text(folder / RUN, to_json({**discovery.run, "status": status}, indent=2))
     return discovery
 
 

@@ -48,6 +48,7 @@ from sipe_bayes.structure.structures import Structures
 _NAMED = 3  # of what was not tried
 _LARGER = 2  # times the budget that did not reach: what to try next
 _BEFORE = {
+    Phase.PLAIN: "the model as it is was fitted to the end",
     Phase.COLUMNS: "any piece was tried",
     Phase.RANK: "what the model may lack was ranked",
     Phase.FIT: "all extensions with a predicted gain were fitted",
@@ -137,7 +138,7 @@ def _untried(structures: Structures) -> str:
     state, search = structures.state, structures.search
     if state.cut is Phase.FIT:
         names = [" with ".join(search.placed[label].sentence for label in labels) for labels in state.queue]
-    elif state.cut in (Phase.COLUMNS, Phase.RANK):
+    elif state.cut in (Phase.PLAIN, Phase.COLUMNS, Phase.RANK):
         there = structures.best.labels
         names = [p.sentence for p in search.placed.values() if p.parameters and p.label not in there]
     else:

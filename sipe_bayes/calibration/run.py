@@ -93,8 +93,8 @@ def calibrate(
         ask = guard.run("scale of the forces", lambda: find_open_scale(problem)).otherwise(())
         if ask:
             announce(
-                f"no motion tells how large {', '.join(ask)} are together: all can grow by a tenth and every motion is "
-                "the same; fix one of them at a measured value, such as a weighed mass, or read them as ratios"
+                f"{', '.join(ask)} are not identifiable together: with all of them 10 % larger the motion is the same. "
+                "Fix one of them at a measured value, such as a weighed mass; else only their ratios can be used."
             )
     posterior = method.fit(problem.train)
     model, space = problem.simulator.model, problem.environment.space

@@ -160,6 +160,9 @@ def calibrate(
         print_calibration(calibration)
         if discovery is not None:
             discover_commands.print_discovery(discovery)
+    if discovery is not None and discovery.ended == "interrupted":
+        say_interrupted("; the same command goes on")
+        raise typer.Exit(INTERRUPTED)
     if doubt(calibration) is not None:
         raise typer.Exit(NOTHING_USABLE)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sipe_bayes.cli.errors import INTERRUPTED, check_least, exit_on_error
+from sipe_bayes.cli.errors import INTERRUPTED, check_least, exit_on_error, say_interrupted
 from sipe_bayes.inference.progress_bar import ProgressBar
 
 if TYPE_CHECKING:
@@ -87,6 +87,7 @@ def discover(
     else:
         print_discovery(discovery)
     if discovery.ended == "interrupted":
+        say_interrupted("; the same command goes on")
         raise typer.Exit(INTERRUPTED)
 
 

@@ -9,7 +9,7 @@ from sipe_bayes.core.finding_texts import Code
 _COMPARE = "Fit again with `--estimator mcmc` and compare the intervals."
 _REMEDY_LACKING = (
     "Run `sipe discover` on the same configuration; it puts in what explains the residuals, and says so. Through "
-    "impacts, where it refuses, add what is named as parameters, fit again, and compare the held-out errors."
+    "impacts, if it refuses the logs, add what is named as parameters, fit again, and compare the held-out errors."
 )
 _BOUNDS = (
     "Widen the bounds if the value could lie beyond. Where the bound is physical, zero friction for instance, the "

@@ -126,8 +126,7 @@ class Code(Enum):
 
     # discover
     SEARCHED_ON_PARTS = note(
-        "the search used {used:.3g} of the logs' {all:.3g} s, in blocks spread over them; `sipe calibrate` of its "
-        "result uses all"
+        "the search used {used:.3g} of the logs' {all:.3g} s; `sipe calibrate` of its result uses all"
     )
     STRUCTURES_CUT_SHORT = blocking(
         "the search ended {why} before {before}{untried}: {remedy}, and the same folder goes on"
@@ -248,13 +247,13 @@ class Code(Enum):
         "noise of {channels} has a correlation time as long as the logs ({tau:.2g} s): mostly changes from sample to "
         "sample were fitted, hardly where the motion goes"
     )
-    MISFIT_NOT_ASKED = note("Whether the residuals are noise is not tested: in hardly any segment nothing touches")
+    MISFIT_NOT_ASKED = note("It was not tested whether the residuals are noise: bodies touch in most segments")
     NOISE_FREE = note(
         "the model explains the logs but for {share:.0e} of what they move, as where they were simulated without "
         "noise: what is left is rounding, and says nothing of the model; the intervals are those of rounding too"
     )
-    UNTOLD = note("no motion tells these numbers, and values hang on them by more than their sd: {moved}")
-    CHECKS_THINNED = note("of the fit's {windows} windows {asked}, spread evenly, were asked what the model lacks")
+    UNTOLD = note("{moved}")
+    CHECKS_THINNED = note("what the model lacks was computed from {asked} of the fit's {windows} segments")
     RESIDUALS_LEFT_OUT = note(
         "Residuals, and whether they are noise: with likelihood = 'state_space' the state is unknown at every sample, "
         "and process noise, which is inferred, takes what the model lacks. Errors and signals are over windows from "

@@ -34,26 +34,11 @@ from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood import UNIFORM_PRECISION, BoundLikelihood, Linearisation, Noise, Segments, StateSpace
 from sipe_bayes.simulation.simulator import Simulator
+from sipe_bayes.structure.discrepancy import LogEstimate
 
 LOG_BUDGET = 5000  # rollouts for each log
-_PIECES = 5  # of a single log, where there is no other to compare it with
 _DETERMINED = (1 - THRESHOLDS.not_determined) / math.sqrt(12)  # sd of a log that tells a parameter: of the prior's
 _FLAT = 1e-6  # precision that keeps a log's information invertible where it leaves a direction open
-
-
-@dataclass(frozen=True)
-class LogEstimate:
-    """One log by itself.
-
-    Args:
-        name: of the log.
-        mean: (N,) in theta.
-        information: (N, N) in theta.
-    """
-
-    name: str
-    mean: FloatArray
-    information: FloatArray
 
 
 @dataclass(frozen=True)
@@ -108,16 +93,6 @@ class Disagreement:
     def text(self) -> str:
         """In words."""
         return self.finding.text
-
-
-def parts_of(windows: BoundLikelihood) -> list[tuple[str, IntArray]]:
-    """Each log's name and windows; of a single one pieces that stand for several, of whole windows."""
-    logs = windows.trajectories
-    if len(logs) > 1:
-        own = [(name, np.flatnonzero(windows.log == k)) for k, name in enumerate(logs.names)]
-        return [(name, mine) for name, mine in own if len(mine)]
-    pieces = np.array_split(np.argsort(windows.start), min(_PIECES, windows.num_windows))
-    return [(logs.names[0], piece) for piece in pieces]
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,7 @@ from sipe_bayes.simulation.simulator import Simulator
 
 _BAND_DRAWS = 64  # of the posterior, whose 5 % and 95 % are drawn
 _NARROW, _FEW_DRAWS = 0.05, 16  # sd of the cube to which the band is to first order; of wider ones so many draws
-_SHORTER = (1.0, 0.5, 0.2, 0.05)  # steps of the starts that are tried, the next where one led uphill
-_SETTLED = 1e-3  # of the sum of squares: a step of the starts that gained less was the last
 _FIRST, _FEWEST = 0.1, 8  # s, and control steps at least: few bodies strike so soon, and six unknowns want as many
-_ITERATIONS = 2  # in which starts are looked for, near the measured ones
 LOOKED_AT = 2000  # control steps that say whether measured starts make most of an error
 _AT_LIMIT = 1e-3  # relative: so near to it a correlation time is the longest that may be
 _PIECES = 10  # of a log: errors of neighbouring samples are not independent, of tenths nearly so
@@ -137,7 +134,7 @@ def _best_squares(windows: BoundLikelihood, theta: FloatArray) -> FloatArray:
 def _best_residuals(windows: BoundLikelihood, theta: FloatArray) -> tuple[FloatArray, bool]:
     """Residuals (W, L, C) of theta (N,) from the starts that fit best, and whether the simulation is valid."""
     noise = Noise(np.maximum(0.05 * np.nan_to_num(windows.spread), windows.rounding), np.zeros(len(windows.fitted)))
-    return _from_best_starts(windows, theta, noise)[1:]
+    return windows.fit_starts(theta, noise)[1:]
 
 
 def _share_of_starts(windows: BoundLikelihood, square: FloatArray, fitted: FloatArray) -> float:
@@ -302,9 +299,8 @@ def fitted_residuals(windows: BoundLikelihood, theta: FloatArray, noise: Noise, 
 
 
 def starts_cost(windows: BoundLikelihood) -> int:
-    """Rollouts of ``best_starts`` at most."""
-    each = windows.num_start + len(_SHORTER)
-    return (1 + _ITERATIONS * each) * len(windows.trajectories)
+    """Rollouts of ``fit_starts`` at most."""
+    return windows.starts_cost * len(windows.trajectories)
 
 
 def band_cost(windows: BoundLikelihood) -> int:
@@ -324,34 +320,5 @@ def measured_starts(windows: BoundLikelihood, theta: FloatArray, near: FloatArra
         return windows.no_starts(len(theta))
     view = windows.beginnings(windows.telling_steps(max(_FEWEST, math.ceil(_FIRST / float(windows.dt.min())))))
     with windows.counting(view):
-        own = [best_starts(view, at, windows.level) for at in (theta if near is None else near[None])]
+        own = [view.fit_starts(at, windows.level)[0] for at in (theta if near is None else near[None])]
     return np.broadcast_to(np.stack(own), (len(theta), *own[0].shape))
-
-
-def best_starts(windows: BoundLikelihood, theta: FloatArray, noise: Noise) -> FloatArray:
-    """Starts (W, D) that minimise the whitened residuals at a fixed theta (N,)."""
-    return _from_best_starts(windows, theta, noise)[0]
-
-
-def _from_best_starts(windows: BoundLikelihood, theta: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray, bool]:
-    """The best starts (W, D), the residuals (W, L, C) from them, and whether that simulation is valid."""
-
-    def simulated(starts: FloatArray) -> tuple[FloatArray, bool]:
-        residual, valid = windows.residuals(theta[None], starts[None])
-        return residual[0], bool(valid[0])
-
-    starts = windows.no_starts()
-    residual, valid = simulated(starts)
-    for _ in range(_ITERATIONS if valid and np.isfinite(residual).all() else 0):
-        linearisation = windows.linearise(theta, starts, with_theta=False, residual=residual)
-        move = windows.log_density(windows.moments(linearisation), noise, starts)[1]
-        before = after = windows.chi_square(residual[None], noise)[0]
-        for share in _SHORTER:
-            tried, good = simulated(starts + share * move)
-            after = windows.chi_square(tried[None], noise)[0] if good else np.inf
-            if after < before:
-                starts, residual = starts + share * move, tried
-                break
-        if not after < (1 - _SETTLED) * before:
-            break
-    return starts, residual, valid

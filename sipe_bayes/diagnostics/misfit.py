@@ -37,7 +37,8 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import Misfit
-from sipe_bayes.structure.augmented import AUGMENTED, FLAT_PRECISION, AtNoise
+from sipe_bayes.likelihood import FLAT_PRECISION
+from sipe_bayes.structure.augmented import AUGMENTED, AtNoise
 from sipe_bayes.structure.discrepancy import Discrepancy
 from sipe_bayes.structure.probes import Probe
 from sipe_bayes.structure.single_effects import SingleEffect
@@ -50,8 +51,6 @@ class MisfitOptions(Options):
     simulated: int = option(199, "draws of the null: p resolves half a percent", least=1)
     pieces: int = option(10, "of a log, among which the largest mean square is looked for", least=1)
     lags: tuple[int, ...] = option((1, 2, 3, 5, 8, 13, 21, 34), "of a channel's memory, at every scale", "samples")
-    alike: float = option(0.2, "of the likeliest cause's probability, from which another is named beside it", least=0)
-    causes: int = option(3, "that are named at most", least=1)
 
 
 MISFIT = MisfitOptions()
@@ -182,7 +181,9 @@ class _Says:
         probes, usable = self.found.at.logs.probes, self.found.usable
         sizes = np.zeros(len(probes))
         sizes[usable] = effect.sizes / max(effect.present, 1e-300)
-        return self._of(self.found.at, sizes, alike(effect, [probes[k] for k in usable]))
+        mine = [probes[k] for k in usable]
+        first = {probe.name: probe for probe in reversed(mine)}
+        return self._of(self.found.at, sizes, [first[name] for name in effect.alike([probe.name for probe in mine])])
 
     def of_probe(self, probe: int) -> Misfit:
         """That a probe of its best size is, beside the noise of the fit."""
@@ -245,18 +246,6 @@ class _Says:
         if held:
             remedy = f"widen the bounds of {', '.join(held)} first, which the log presses against, or {remedy}"
         return Misfit(self.p, cause, remedy, name, windows.fitted[channel], *span, shares, shift)
-
-
-def alike(effect: SingleEffect, probes: list[Probe]) -> list[Probe]:
-    """What an effect may be, the likeliest first: of its R columns' probes one of each name."""
-    chance: dict[str, float] = {}
-    first: dict[str, Probe] = {}
-    for k in np.argsort(-effect.by_column).tolist():
-        name = probes[k].name
-        chance[name] = chance.get(name, 0.0) + float(effect.by_column[k])
-        first.setdefault(name, probes[k])
-    ranked = sorted(chance, key=lambda name: -chance[name])
-    return [first[name] for name in ranked if chance[name] >= MISFIT.alike * chance[ranked[0]]][: MISFIT.causes]
 
 
 def _foretold(z: FloatArray) -> FloatArray:

@@ -8,12 +8,11 @@ sample j-1, which may lie in the window before. So the whitened rows of w have t
 
 from __future__ import annotations
 
-import copy
 import itertools
 
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.sequences import Sequence, coefficients
 
@@ -96,14 +95,6 @@ class Moments:
             out[:, 1, :, lag[:, None], own] += np.swapaxes(cross, 0, 1)
             out[:, 2, :, lag[:, None], lag] += np.moveaxis(part[..., size:, size:], (2, 3), (0, 1))
         return out
-
-    def chosen(self, columns: IntArray, num_theta: int) -> Moments:
-        """Moments of some of the columns [theta | x_w | x_{w-1} | r]; the first ``num_theta`` are theta's."""
-        part, width = copy.copy(self), self.num_theta + 2 * self.num_start + 1
-        products = self.products.reshape(-1, self.windows, width, width)
-        products = products.take(columns, axis=-1).take(columns, axis=-2)
-        part.products, part.num_theta = products.reshape(len(products), -1), num_theta
-        return part
 
     def correlation_times(self) -> FloatArray:
         """A first guess (C,) in seconds from the residual's autocorrelation over each channel's commonest gap."""

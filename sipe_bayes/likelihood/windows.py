@@ -52,6 +52,9 @@ from sipe_bayes.simulation.tangents import moved
 
 _BY_SAMPLE = ("owned", "compared", "measured", "observed")  # what a part of the windows has a part of
 _BY_WINDOW = ("number", "log", "start", "stride", "lead", "begin", "steps", "dt", "actions", "reference", *_BY_SAMPLE)
+_SHORTER = (1.0, 0.5, 0.2, 0.05)  # steps of the starts that are tried, the next where one led uphill
+_SETTLED = 1e-3  # of the sum of squares: a step of the starts that gained less was the last
+_ITERATIONS = 2  # in which starts are looked for, near the measured ones
 
 
 @dataclass(frozen=True)
@@ -456,6 +459,38 @@ class Windows:
         """Whether the log tells where every window starts: recorded states, or a measured position of each joint."""
         return all_starts_measured(self.simulator, self.trajectories)
 
+    @property
+    def starts_cost(self) -> int:
+        """Rollouts of each log that ``fit_starts`` takes at most."""
+        return 1 + _ITERATIONS * (self.num_start + len(_SHORTER))
+
+    def fit_starts(self, theta: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray, bool]:
+        """Starts (W, D) that minimise the whitened residuals at a fixed theta (N,).
+
+        Returns:
+            Them, the residuals (W, L, C) from them, and whether that simulation is valid.
+        """
+
+        def simulated(starts: FloatArray) -> tuple[FloatArray, bool]:
+            residual, valid = self.residuals(theta[None], starts[None])
+            return residual[0], bool(valid[0])
+
+        starts = self.no_starts()
+        residual, valid = simulated(starts)
+        for _ in range(_ITERATIONS if valid and np.isfinite(residual).all() else 0):
+            linearisation = self.linearise(theta, starts, with_theta=False, residual=residual)
+            move = self.log_density(self.moments(linearisation), noise, starts)[1]
+            before = after = self.chi_square(residual[None], noise)[0]
+            for share in _SHORTER:
+                tried, good = simulated(starts + share * move)
+                after = self.chi_square(tried[None], noise)[0] if good else np.inf
+                if after < before:
+                    starts, residual = starts + share * move, tried
+                    break
+            if not after < (1 - _SETTLED) * before:
+                break
+        return starts, residual, valid
+
     def linearise(
         self,
         theta: FloatArray,
@@ -531,14 +566,6 @@ class Windows:
         """Products of the linearised rows, from which the normal equations of any noise follow, or of white alone."""
         n = lin.jacobian.shape[-1] - self.num_start
         return Moments(lin.residual, lin.jacobian, n, self.sequences, white)
-
-    def moments_of_each(self, residuals: FloatArray, jacobian: FloatArray) -> list[Moments]:
-        """For each of residuals (W, L, C, S) its ``moments`` with a jacobian (W, L, C, N + D), formed together."""
-        n, many = jacobian.shape[-1] - self.num_start, residuals.shape[-1]
-        rows = np.concatenate([jacobian[..., :n], residuals, jacobian[..., n:]], axis=-1)
-        whole = self.moments(Linearisation(np.zeros(rows.shape[:3]), rows, True))
-        starts = n + many + np.arange(2 * self.num_start)
-        return [whole.chosen(np.concatenate([np.arange(n), starts, [n + s]]), n) for s in range(many)]
 
     def chi_square(self, residual: FloatArray, noise: Noise) -> FloatArray:
         """Whitened sum of squares (B,) of residuals (B, W, L, C)."""

@@ -192,7 +192,7 @@ def marginal_grid(
         narrow = None if plain is None else plain[:, j]
         marginal(ax, parameter, theta[:, j], prior, intervals[:, j], default, truth[j], narrow)
     shown = [line_handle(POSTERIOR, "posterior"), shade_handle(POSTERIOR, "90 % interval")]
-    shown += [line_handle(POSTERIOR, "if the model lacked nothing", ":")] * (plain is not None)
+    shown += [line_handle(POSTERIOR, "model-conditional", ":")] * (plain is not None)
     legend_above(figure, [*shown, *reference_handles(truth)], 5)
     return figure
 

@@ -1,9 +1,8 @@
 """What a policy may be trained under: the distribution whose intervals the report says to use.
 
-Where a wider interval stands beside the plain one, with what the model lacks or may lack, draws come from theta with
-that (``diagnostics.misfit.missing_physics``), correlations included, each parameter stretched to the ends that are
-printed. Where no value of a parameter may be used, it is drawn from its prior, by default all of its bounds, whatever
-the others are: the logs defend nothing narrower.
+Draws come from the discrepancy-aware posterior where there is one (``structure.discrepancy``), correlations included.
+Where no value of a parameter may be used, it is drawn from its prior, by default all of its bounds, whatever the others
+are: the logs defend nothing narrower.
 """
 
 from __future__ import annotations

@@ -271,7 +271,7 @@ def lack(calibration: Calibration) -> Verdict | None:
     """What the model lacks, where that matters; the warnings say more."""
     misfit = calibration.misfit
     if misfit is None and any(f.code is Code.MISFIT_NOT_ASKED for f in calibration.findings):
-        return Verdict("fair", "Whether the model lacks something was not asked: segments meet impacts.")
+        return Verdict("fair", "It was not asked whether the model lacks something: bodies touch in most segments.")
     if misfit is None or not misfit.alarm:
         return None
     share = f"{number(100 * misfit.share[misfit.channel], 2)} % of the residual of {misfit.channel}"
@@ -361,7 +361,8 @@ def _allowed_for(calibration: Calibration) -> Verdict:
     pairs = [(p.further, (p.q05, p.q95)) for p in calibration.parameters if p.further is not None]
     wider = max((high - low) / (b - a) if b > a else 1.0 for (low, high), (a, b) in pairs)
     text = f"Nothing is seen to be missing; the first intervals, at most {100 * (wider - 1):.0f} % wider than the plain"
-    return Verdict("good", f"{text} ones, allow for what would not show, most of all {listed(_named(calibration))}.")
+    most = f", most of all {listed(_named(calibration))}" if calibration.causes else ""
+    return Verdict("good", f"{text} ones, allow for what would not show{most}.")
 
 
 def _named(calibration: Calibration) -> list[str]:

@@ -28,15 +28,20 @@ import scipy.optimize
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
 from sipe_bayes.core.options import Options, option
-from sipe_bayes.diagnostics.evaluate import best_starts
 from sipe_bayes.inference.recorded import Tell, silent
-from sipe_bayes.likelihood import BoundLikelihood, Eliminated, Linearisation, Noise, QuadraticPrior
+from sipe_bayes.likelihood import (
+    FLAT_PRECISION,
+    BoundLikelihood,
+    Eliminated,
+    Linearisation,
+    Noise,
+    QuadraticPrior,
+)
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.structure.extension import Placed
 from sipe_bayes.structure.probes import place_extensions, probes, probes_cost
 from sipe_bayes.structure.whitened_rows import WhitenedRows
 
-FLAT_PRECISION = 1e-6  # keeps information invertible where a direction is open
 _SHORT = 50  # samples, of which no memory is asked
 _FAINT = 1e-6  # of a probe's information, of its prior: what theta and the starts imitate to within that has no size
 _PRESSED = 1e-6  # of the range: a parameter that the search left on its bound
@@ -131,18 +136,21 @@ class AugmentedModel:
     ) -> None:
         if placed is None:
             placed = place_extensions(windows, theta, windows.no_starts() if starts is None else starts)
-        some = windows.spread_over(steps_of(windows, placed))
+        whole, some = windows, windows.spread_over(steps_of(windows, placed))
         self.share = windows.num_windows / len(some)
         if len(some) < windows.num_windows:
             windows, starts = windows.part(some), None if starts is None else starts[some]
             lin = None if lin is None else lin.part(some)
-        starts = best_starts(windows, theta, noise) if starts is None else starts
+        starts = windows.fit_starts(theta, noise)[0] if starts is None else starts
         prior = QuadraticPrior(theta, np.zeros((len(theta), len(theta)))) if prior is None else prior
         self.windows, self.theta, self.noise, self.starts = windows, theta, noise, starts
         linearisation = lin or windows.linearise(theta, starts)
         if not linearisation.valid:
             raise ValueError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
-        made = probes(windows, theta, starts, placed, shorter, tell, kept)
+        try:
+            made = probes(windows, theta, starts, placed, shorter, tell, kept)
+        finally:
+            whole.rollouts = windows.rollouts
         self.probes, self.one_sided, self.effects = made.named, made.one_sided, made.effects
         n = windows.num_theta
         parts = (linearisation.jacobian[..., :n], made.change, linearisation.jacobian[..., n:])

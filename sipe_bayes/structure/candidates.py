@@ -29,14 +29,12 @@ class Candidate:
         placed: which.
         gain: log-likelihood that it is to gain, in nats.
         theta: (P,) its parameters where a fit is to start.
-        amplitude: (K,) of its probes.
         others: (N,) where the parameters beside it are to start.
     """
 
     placed: Placed
     gain: float
     theta: FloatArray
-    amplitude: FloatArray
     others: FloatArray
 
 
@@ -88,4 +86,4 @@ def _candidate(logs: AugmentedModel, effect: Effect, columns: IntArray, plain: f
     if whole > 0 and not effect.trades.any():
         value = np.where(shaped, np.abs(amplitude) / whole @ probes, value)
     gain = logs.share * (level - plain)
-    return Candidate(effect.placed, gain, np.clip(value, *_INSIDE), amplitude, others)
+    return Candidate(effect.placed, gain, np.clip(value, *_INSIDE), others)

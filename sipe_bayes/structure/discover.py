@@ -112,7 +112,7 @@ def discover(
 
     Raises:
         ValueError: for a simulator of anything but an MJCF, unknown extensions, sites that the model does not have, or
-            logs in which bodies touch nearly all along.
+            logs in hardly any span of which nothing touches.
         CheckpointError: for a checkpoint that is damaged or of another run.
         SearchInterrupted: with what the search has, where it is interrupted.
     """
@@ -211,25 +211,39 @@ def _search(
         whole("seed", seed, 0),
         simulator.num_threads or cores(),
     )
-    windows = fitting.windows(simulator)
-    if windows.impacts:
-        free = between_contacts(windows)
-        held = None if holdout is None else between_contacts(BoundLikelihood(fitting.likelihood, simulator, holdout))
-        if free is None or any(parameter.log is not None for parameter in environment.parameters):
-            raise ValueError(
-                "logs: bodies touch nearly all along them, and fits of two structures through impacts do not compare; "
-                "add what you suspect as parameters, fit with likelihood = 'state_space', and compare held-out errors"
-            )
-        whole_spans = replace(fitting.likelihood, window=None, windows=())
-        fitting = replace(fitting, trajectories=free, holdout=held, likelihood=whole_spans)
+    if fitting.windows(simulator).impacts:
+        fitting = _between_contacts(fitting, simulator)
     most = whole("budget", budget, 1, "rollouts", MOST_ROLLOUTS)
     return StructureSearch(fitting, extensions, restriction.sites, options, most, progress, restriction.finer)
 
 
-def between_contacts(windows: BoundLikelihood) -> Trajectories | None:
-    """The spans of logs in which nothing touches; None of hardly any."""
-    spans = windows.spans_apart(LEAST_SPAN)
-    return Trajectories.stack(spans) if len(spans) >= FEWEST_APART else None
+def _between_contacts(fitting: Fitting, simulator: Simulator) -> Fitting:
+    """The same on the spans of the logs in which nothing touches, held-out ones too, short spans as one window each."""
+    environment = fitting.environment
+    if environment.added or any(parameter.log is not None for parameter in environment.parameters):
+        raise ValueError(
+            "logs: bodies strike or slip along them, and what holds for single logs is not told between contacts; "
+            "search without weighed loads and parameters of single logs"
+        )
+    both = [fitting.windows(simulator).spans_apart(LEAST_SPAN)]
+    if fitting.holdout is not None:
+        both.append(BoundLikelihood(fitting.likelihood, simulator, fitting.holdout).spans_apart(LEAST_SPAN))
+    if sum(len(span) for span in both[0]) < FEWEST_APART * LEAST_SPAN:
+        raise ValueError(
+            "logs: in hardly any span nothing touches, and fits of two structures through impacts do not compare; "
+            "add what you suspect as parameters, fit with likelihood = 'state_space', and compare held-out errors"
+        )
+    window = fitting.likelihood.window
+    short = [(span.name, None) for spans in both for span in spans if window and len(span) * span.dt < window]
+    train, *held = (Trajectories.stack(spans) if spans else None for spans in both)
+    assert train is not None
+    return replace(
+        fitting,
+        trajectories=train,
+        holdout=held[0] if held else None,
+        likelihood=replace(fitting.likelihood, windows=tuple(short)),
+        spans=True,
+    )
 
 
 def _check_sites(environment: MjcfEnvironment, sites: Sequence[str] | None) -> None:

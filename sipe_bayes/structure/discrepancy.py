@@ -25,6 +25,9 @@ Deviations:
   linearisation of dry friction is no better. With a tolerance they keep it, without one they are left out.
 - How much of what is moved to first order is moved in truth is normal around all of it, of sd ``reach``, and not
   negative: a linearisation is right to about a half where effects are large.
+- A number with a tolerance that the logs do not show moves theta only where something else is more likely missing than
+  not; elsewhere it is named (``contributions``), with what it would move: an interval that is ten times wider for the
+  gain of a motor that may be right is of no use.
 - A delay or lag that takes from a parameter what it adds moves theta by the root of its size (``structure.probes``);
   where all are at work nothing is traded: the root of a small size is not small, and a delay would be wide on any log.
 """
@@ -41,8 +44,7 @@ import torch
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.options import Options, option
-from sipe_bayes.diagnostics.agreement import LogEstimate, parts_of
-from sipe_bayes.likelihood import UNIFORM_PRECISION, Noise
+from sipe_bayes.likelihood import UNIFORM_PRECISION, BoundLikelihood, Noise
 from sipe_bayes.posterior import GaussianMixture, Particles, Posterior
 from sipe_bayes.structure.augmented import AtNoise, AugmentedModel
 from sipe_bayes.structure.physics_step import PHYSICS_STEP
@@ -50,6 +52,7 @@ from sipe_bayes.structure.probes import Probe
 from sipe_bayes.structure.single_effects import EFFECTS, Columns, Effects, find_effects
 from sipe_bayes.structure.tolerances import EXACT, Tolerances
 
+_PIECES = 5  # of a single log, where there is no other to compare it with
 _NOTHING = 1e-150  # information of a column that moves nothing: its square is no number
 _ENDS = (0.05, 0.95)  # of the intervals that are printed
 _SAME = 1e-3  # of a column's information: what is left of it beside a number with a tolerance that is the same
@@ -98,7 +101,12 @@ class Discrepancy:
             single[:, self.usable] = sum(effect.draws(count, random) for effect in self.effects.single)
             every[:, self.usable] = self.effects.every.draws(count, random)
         sizes = single + every
-        sizes += self.known.draws(sizes, random)
+        known = self.known.draws(sizes, random)
+        if not self.is_doubted:
+            known[:, ~asked(self.at) & ~np.array([probe.extension is PHYSICS_STEP for probe in logs.probes], bool)] = (
+                0.0
+            )
+        sizes += known
         share = np.maximum(1 + DISCREPANCY.reach * random.standard_normal((count, 1)), 0.0)
         released = made.base - logs.seen.projected.base  # of parameters that come away from their bounds
         moved = released + share * (logs.traded(single) - sizes @ made.answer.T)
@@ -107,7 +115,8 @@ class Discrepancy:
     def _stretched(self, posterior: Posterior, random: np.random.Generator) -> FloatArray:
         """Draws (M, N) of a posterior, stretched by what samples tell less and by what logs differ."""
         before, after = (np.diag(at.projected.covariance) for at in (self.at.logs.seen, self.at))
-        stretch = np.sqrt(np.where(before > 0, after / np.where(before > 0, before, 1.0), 1.0))
+        both = (before > 0) & (after > 0)  # else a bound holds the parameter
+        stretch = np.sqrt(np.where(both, after / np.where(both, before, 1.0), 1.0))
         generator = torch.Generator().manual_seed(int(random.integers(2**31)))
         count, normal = (DISCREPANCY.draws,), isinstance(posterior, GaussianMixture)
         wider = _before_the_cube(posterior, stretch) if isinstance(posterior, GaussianMixture) else posterior
@@ -117,6 +126,11 @@ class Discrepancy:
             theta = middle + stretch * (theta - middle)
         apart = self.spread.draws(len(theta), random) * np.sqrt(np.maximum(after, 0.0))
         return np.asarray(theta + apart * random.standard_normal(theta.shape))
+
+    @property
+    def is_doubted(self) -> bool:
+        """Whether it is more likely than not that an effect is at work, or that logs differ."""
+        return bool(self.causes) or self.spread.weights[0] < 0.5
 
     def contributions(self) -> list[Contribution]:
         """What each number with a tolerance adds to what is not known of theta."""
@@ -131,12 +145,37 @@ class Discrepancy:
 
     @property
     def causes(self) -> tuple[str, ...]:
-        """Extensions that are more likely at work than not, in words; of what cannot be told apart the likeliest."""
+        """Extensions that are more likely at work than not, in words; those that no log tells apart as one."""
         if self.effects is None:
             return ()
         seen = [effect for effect in self.effects.single if effect.present > 0.5]
-        names = [self.at.logs.probes[self.usable[int(effect.by_column.argmax())]].name for effect in seen]
-        return tuple(dict.fromkeys(names))
+        asked_for = [self.at.logs.probes[k].name for k in self.usable]
+        return tuple(dict.fromkeys(" or ".join(effect.alike(asked_for)) for effect in seen))
+
+
+@dataclass(frozen=True)
+class LogEstimate:
+    """One log by itself.
+
+    Args:
+        name: of the log.
+        mean: (N,) in theta.
+        information: (N, N) in theta.
+    """
+
+    name: str
+    mean: FloatArray
+    information: FloatArray
+
+
+def parts_of(windows: BoundLikelihood) -> list[tuple[str, IntArray]]:
+    """Each log's name and windows; of a single one pieces that stand for several, of whole windows."""
+    logs = windows.trajectories
+    if len(logs) > 1:
+        own = [(name, np.flatnonzero(windows.log == k)) for k, name in enumerate(logs.names)]
+        return [(name, mine) for name, mine in own if len(mine)]
+    pieces = np.array_split(np.argsort(windows.start), min(_PIECES, windows.num_windows))
+    return [(logs.names[0], piece) for piece in pieces]
 
 
 @dataclass(frozen=True)

@@ -91,6 +91,7 @@ class Fitting:
         seed: of the searches.
         num_threads: native ones.
         ends: on the monotonic clock, when fits end with what they have.
+        spans: whether the logs are spans of logs, between contacts: then nothing is of a single log.
     """
 
     environment: MjcfEnvironment
@@ -101,6 +102,7 @@ class Fitting:
     seed: int
     num_threads: int
     ends: float = math.inf
+    spans: bool = False
 
     def enough(self, placed: Sequence[Placed]) -> int:
         """Rollouts of as many steps of a fit as lead to its optimum."""

@@ -40,7 +40,7 @@ class PhysicsStep(Extension):
 
     def off(self, site: str, share: float) -> str:
         """In a report."""
-        return self.sentence(site)
+        return "the effect of the physics step"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """None."""
@@ -145,7 +145,7 @@ def step_error(windows: BoundLikelihood, theta: FloatArray, starts: FloatArray) 
         return None
     own = 1 + simulator.model.nq + simulator.model.nv + simulator.model.na  # columns: time and what moves
     bound.reference[:, :own] = windows.reference[:, :own]
-    bound.budget = windows.budget - windows.rollouts
+    bound.budget, bound.deadline = windows.budget - windows.rollouts, windows.deadline
     begun = mapped_starts(simulator.model, half.model, starts)
     try:
         fine, finely = bound.predict(theta[None], begun[None], in_float64=True)

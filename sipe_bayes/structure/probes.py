@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -63,9 +63,7 @@ class Probe:
         whole: its size where the number that it changes is off by all that a tolerance is a share of; nan where logs
             alone tell that number.
         trade: (N,) by which it changes theta itself at size 1, and with the root of any other; none where not at all.
-        placed: the extension at that site; None of what has no parameters.
-        tried: (P,) theta of its parameters where it was simulated.
-        size: that it then has.
+        size: root-mean-square of its effect where it was simulated.
     """
 
     name: str
@@ -75,8 +73,6 @@ class Probe:
     extension: Extension | None = None
     whole: float = math.nan
     trade: tuple[float, ...] = ()
-    placed: Placed | None = field(default=None, compare=False)
-    tried: tuple[float, ...] = ()
     size: float = math.nan
 
 
@@ -195,10 +191,9 @@ def _named(effect: Effect) -> list[Probe]:
     remedy = f"add {' and '.join(targets)} {what}"
     if placed.edit is not None:  # the model has no such part yet
         remedy = f"let `sipe discover` put it in (--only {placed.extension.name})"
-    probe = Probe(placed.sentence, remedy, by_log, placed.site, placed.extension, placed=placed)
+    probe = Probe(placed.sentence, remedy, by_log, placed.site, placed.extension)
     size, away = _size(effect.change), effect.probes - placed.plain
-    tried = zip(effect.probes.tolist(), size.tolist(), strict=True)
-    named = [replace(probe, tried=tuple(row), size=own) for row, own in tried]
+    named = [replace(probe, size=own) for own in size.tolist()]
     if effect.trades.any():
         sized = effect.trades / np.sqrt(size)[:, None]
         return [replace(one, trade=tuple(row)) for one, row in zip(named, sized.tolist(), strict=True)]
@@ -293,7 +288,7 @@ def _simulated(
 ) -> list[Effect]:
     """Effects of extensions that the simulator's model has."""
     bound = BoundLikelihood(windows.settings, simulator, windows.trajectories, windows)
-    bound.budget = windows.budget - windows.rollouts
+    bound.budget, bound.deadline = windows.budget - windows.rollouts, windows.deadline
     plain = np.concatenate([theta, *(one.plain for one in group)])
     rows, first = [plain], len(theta)
     tried = [_traded(windows.simulator.space, theta, one) for one in group]

@@ -84,10 +84,9 @@ class StructureSearch:
         self._rollouts, self._fit_rollouts = state.rollouts, 0
         self._doing = state.describe(len(self._ladder.pieces(self._placed)))
         self._tell("")
-        spent = state.rollouts >= self.budget or time.monotonic() > self.fitting.ends
-        if time.monotonic() > self.fitting.ends:
-            self.ended = "time"
-        if state.phase is not Phase.PLAIN and spent:
+        over = state.rollouts >= self.budget or self.is_late
+        if state.phase is not Phase.PLAIN and state.fitted and over:
+            self.ended = "time" if self.is_late else self.ended
             return replace(state, phase=Phase.DONE, cut=state.cut if state.done else state.phase)
         state = {
             Phase.PLAIN: self._plain,
@@ -98,7 +97,15 @@ class StructureSearch:
             Phase.RESIDUAL: self._residual,
             Phase.DONE: lambda state: state,
         }[state.phase](state)
-        return state if state.cut is None else replace(state, phase=Phase.DONE)
+        if state.cut is None:
+            return state
+        self.ended = "time" if self.is_late else self.ended
+        return replace(state, phase=Phase.DONE)
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the time limit has passed."""
+        return time.monotonic() > self.fitting.ends
 
     def _tell(self, what: str, rollouts: int = 0, _: int = 0) -> None:
         """How far the present step is, after some rollouts of a fit of its own; fewer are those of its next fit."""
@@ -115,8 +122,9 @@ class StructureSearch:
 
     def counts(self, state: DiscoverState, one: FittedStructure) -> bool:
         """Whether a structure has named extensions alone, and the budget did not end in its fit."""
-        cut_off = state.cut is not None and one is state.fitted[-1] is not state.fitted[0] and not one.settled
-        return not cut_off and not any(self._placed[label].extension.last_resort for label in one.labels)
+        return one.labels != state.cut_off and not any(
+            self._placed[label].extension.last_resort for label in one.labels
+        )
 
     def supported(self, state: DiscoverState) -> list[FittedStructure]:
         """The set that the logs support: ties, the simplest one first, of native elements where these do as well."""
@@ -151,6 +159,8 @@ class StructureSearch:
         windows = self.fitting.windows(self.fitting.simulator([]))
         self._machine = machine_of(windows, plain.theta, plain.starts)
         every = (p for e in self.extensions for p in placements(e, self._machine))
+        if self.fitting.spans:
+            every = (p for p in every if all(parameter.log is None for parameter in p.parameters))
         allowed = None if self.joints is None else set(self.joints)
         self._placed = {p.label: p for p in every if allowed is None or allowed.issuperset(members(p.site))}
         steps = {p.label: p for p in shorter_steps(windows)} if self.finer else {}
@@ -159,7 +169,8 @@ class StructureSearch:
     def _plain(self, state: DiscoverState) -> DiscoverState:
         """The plain model, where it can be fitted at all."""
         plain, _ = self._try([], min(self.enough([]), int(self.options.plain_share * self.budget)))
-        return replace(state, fitted=() if plain is None else (plain,), phase=Phase.COLUMNS)
+        cut = Phase.PLAIN if plain is not None and self.is_late and not plain.settled else None
+        return replace(state, fitted=() if plain is None else (plain,), phase=Phase.COLUMNS, cut=cut)
 
     def _columns(self, state: DiscoverState) -> DiscoverState:
         """The column whose factor makes the plain model fit far better, if any does."""
@@ -174,9 +185,9 @@ class StructureSearch:
             rests = set(np.array(windows.fitted)[~shown].tolist())
             share = {name: left.get(name, 0.0) for name in share if name not in rests}
         columns, tried, spent, number = choices(channels, share), [], 0, 0
-        # without a plain model there is nothing else to spend the budget on
+        # without a plain model there is nothing else to spend the budget on; late, what was tried is tried again
         most = self.budget if plain is None else options.column_share * (self.budget - plain.rollouts)
-        while number < len(columns) and spent + options.column_budget <= most:
+        while number < len(columns) and spent + options.column_budget <= most and not self.is_late:
             column, number = columns[number], number + 1
             doing = replace(state, phase=Phase.COLUMNS).describe(0)
             self._doing = f"{doing}, {number} of {len(columns)}"
@@ -224,7 +235,7 @@ class StructureSearch:
         """The structures with the largest predicted gains, beside what their part gains already; no tried ones.
 
         Beside the model as it is, as many again whose predicted gains are the same to two standard errors. Shorter
-        integration steps always: what long ones do looks like a delay, a filter or a spring.
+        integration steps with a predicted gain always: what long ones do looks like a delay, a filter or a spring.
         """
         options, plain, queue = self.options, state.fitted[0], dict[frozenset[str], tuple[float, tuple[str, ...]]]()
         for labels in state.beam:
@@ -236,7 +247,7 @@ class StructureSearch:
                 if offer.gain > options.least_gain and not state.is_tried(grown):
                     queue.setdefault(frozenset(grown), (before + offer.gain, grown))
         ranked = sorted(queue.values(), key=lambda item: -item[0])
-        best = next((gain for gain, _ in ranked if math.isfinite(gain)), 0.0)  # none where shorter steps diverge
+        best = ranked[0][0] if ranked else 0.0
         level = best - 2 * math.sqrt(2 * max(best, 0.0))
         most = 2 * options.width if state.beam == ((),) else options.width
         close = [(gain, grown) for gain, grown in ranked[options.width : most] if gain >= level]
@@ -270,6 +281,8 @@ class StructureSearch:
                 gain = 0.0 if finer is None else gain_of_steps(logs)
         except BudgetExhausted:
             cut = state.phase
+        except ValueError:  # LinAlgError is one: of a structure that diverges nothing can be predicted
+            ranked = []
         offers = tuple(Offer(here.labels, c.placed.label, c.gain, c.theta, c.others) for c in ranked)
         ranks = state.rank_rollouts + windows.rollouts
         if finer is not None and gain > 0:
@@ -342,7 +355,7 @@ class StructureSearch:
             most = self.enough(labels)
             cut = state.phase if left < most else None
             one = self.fitting.fit(self.structure(labels), initial, max(min(most, left), 1), self._tell)
-            cut = state.phase if time.monotonic() > self.fitting.ends else cut
+            cut = state.phase if self.is_late else cut
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
             spent = state.failed_rollouts + self._fit_rollouts
             cut = cut if isinstance(error, BudgetTooSmall) else None
@@ -352,7 +365,8 @@ class StructureSearch:
         if state.surpasses(one):  # on the way, with the noise of a stage that is not the last
             spent = state.failed_rollouts + one.rollouts
             return replace(state, failed=(*state.failed, labels), failed_rollouts=spent, cut=cut)
-        return replace(state, fitted=(*state.fitted, one), cut=cut)
+        cut_off = None if cut is None else labels
+        return replace(state, fitted=(*state.fitted, one), cut=cut, cut_off=cut_off)
 
 
 def _is_better(one: FittedStructure, part: FittedStructure) -> bool:

@@ -55,6 +55,8 @@ class EffectOptions(Options):
     largest: float = option(3000.0, "of the grid of that root", "sds", above=0)
     sizes: int = option(25, "between these two, evenly in their logarithm", least=2)
     effects: int = option(5, "single ones at most: a dozen small ones together explain anything", least=1)
+    alike: float = option(0.2, "of the likeliest one's probability, from which another is named beside it", least=0)
+    named: int = option(3, "that are named at most", least=1)
     rounds: int = option(30, "over all effects at most, until they settle", least=1)
 
     @property
@@ -123,6 +125,14 @@ class SingleEffect:
     def present(self) -> float:
         """The probability that it is not none."""
         return float(self.weights.sum())
+
+    def alike(self, names: Sequence[str]) -> list[str]:
+        """What it may be, the likeliest first: of the columns' names (K,) those that are hardly less likely."""
+        chance: dict[str, float] = {}
+        for name, own in zip(names, self.by_column.tolist(), strict=True):
+            chance[name] = chance.get(name, 0.0) + own
+        ranked = sorted(chance, key=lambda name: -chance[name])
+        return [name for name in ranked if chance[name] >= EFFECTS.alike * chance[ranked[0]]][: EFFECTS.named]
 
     @property
     def against(self) -> float:

@@ -81,7 +81,8 @@ class DiscoverState:
         rank_rollouts: of the rankings.
         failed_rollouts: of fits that failed, as far as they told.
         untried: signs and units that their share of the budget did not reach.
-        cut: what the search was doing when the budget was spent; None while it is not.
+        cut: what the search was doing when it was cut short; None while it is not.
+        cut_off: labels of the structure whose fit was, which counts for nothing then; None where none was.
         budget: rollouts at most, of which the plain fit and the trials of columns get a share.
     """
 
@@ -99,6 +100,7 @@ class DiscoverState:
     failed_rollouts: int = 0
     untried: tuple[Column, ...] = ()
     cut: Phase | None = None
+    cut_off: tuple[str, ...] | None = None
     budget: int = 0
 
     def with_budget(self, budget: int, plain_fit: float) -> DiscoverState:

@@ -28,6 +28,7 @@ FILES = [
 CHECKS = [
     *(
         "forecast",
+        "scale of the forces",
         "summary of each parameter",
         "what is kept of checks",
         "the most probable value",

@@ -281,7 +281,7 @@ def test_logs_that_differ_have_an_interval_for_a_further_one(tmp_path: Path, log
 
 
 @pytest.mark.usefixtures("unreported")
-@pytest.mark.parametrize("part", ["lacking.ProbedLogs", "predictions.outside_prior"])
+@pytest.mark.parametrize("part", ["lacking.AugmentedModel", "predictions.outside_prior"])
 def test_a_check_that_fails_is_one_warning(
     part: str, tmp_path: Path, log: pd.DataFrame, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,8 +7,9 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.agreement import LogEstimate, disagreement, log_estimates
+from sipe_bayes.diagnostics.agreement import disagreement, log_estimates
 from sipe_bayes.likelihood import Segments
+from sipe_bayes.structure.discrepancy import LogEstimate
 from tests.problems.pendulums import log, pendulum
 
 SEEDS = range(8)

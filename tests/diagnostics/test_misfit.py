@@ -14,7 +14,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Severity
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.evaluate import best_starts, both_predicted
+from sipe_bayes.diagnostics.evaluate import both_predicted
 from sipe_bayes.diagnostics.misfit import _whiteness, drawn, misfit, oddness, statistics
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, follows, outlier_factors, outside_prior
 from sipe_bayes.diagnostics.records import Misfit
@@ -124,7 +124,7 @@ def residuals(rho: float) -> AugmentedModel:
     theta = simulator.space.normalise(np.array([0.6, 0.08]))
     noise = Noise(np.array([0.01]), np.array([0.0 if rho == 0 else -0.01 / np.log(rho)]))
     flat = QuadraticPrior(theta, np.zeros((2, 2)))
-    return AugmentedModel(windows, theta, noise, best_starts(windows, theta, noise), flat)
+    return AugmentedModel(windows, theta, noise, windows.fit_starts(theta, noise)[0], flat)
 
 
 def test_what_a_fit_takes_for_slow_noise_is_named_beside_the_samples_scatter() -> None:

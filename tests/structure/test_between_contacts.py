@@ -11,7 +11,7 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood import Segments, bind
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.discover import FEWEST_APART, Restriction, between_contacts, discover
+from sipe_bayes.structure.discover import FEWEST_APART, LEAST_SPAN, Restriction, discover
 
 DT, SD = 0.01, 0.001
 XML = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
@@ -52,17 +52,28 @@ def test_drag_is_found_in_flight_and_only_where_there_is_some(drag: float, found
 
 def test_spans_are_those_in_which_the_ball_flies() -> None:
     log = dropped(0.0, 1)
-    spans = between_contacts(bind(Segments(0.5), ball(), Trajectories.stack([log])))
-    assert spans is not None
+    spans = bind(Segments(0.5), ball(), Trajectories.stack([log])).spans_apart(LEAST_SPAN)
     assert len(spans) >= FEWEST_APART
     assert all(np.nanmin(span.observations[:, 1]) > -0.95 - 3 * SD for span in spans)
     assert 0.5 < sum(len(span) for span in spans) / len(log) < 1.0
     assert all(span.name.startswith("drop 1 from ") for span in spans)
 
 
+def test_nothing_is_of_a_single_log_between_contacts() -> None:
+    """Two flights of one log have no gains of their own; one flight is enough to be searched, held-out ones too."""
+    log, other = dropped(0.1, 1, seconds=0.9), dropped(0.1, 2, seconds=0.9)
+    few = Restriction(only=("log_gain", "viscous_friction"))
+    found = discover(ball(), Trajectories.stack([log]), holdout=Trajectories.stack([other]), restriction=few)
+    assert not any(label.startswith("log_gain") for label in found.search.placed)
+    assert found.search.fitting.holdout is not None
+    assert {name.partition(" from ")[0] for name in found.search.fitting.trajectories.names} == {"drop 1"}
+
+
 def test_what_touches_all_along_is_refused_in_one_line() -> None:
     low = XML.replace('pos="0 0 1"', 'pos="0 0 0.05"')
     simulator = Simulator(MjcfEnvironment.build(low, [GAIN], ["push"], ["joint:x.position", "joint:z.position"]), 1)
-    log = dropped(0.0, 1)
-    rests = Trajectory(np.zeros_like(log.observations), log.actions, DT, name="rests", channels=log.channels)
-    assert between_contacts(bind(Segments(0.5), simulator, Trajectories.stack([rests]))) is None
+    log, random = dropped(0.0, 1), np.random.default_rng(0)
+    rolls = np.stack([0.3 * np.sin(0.1 * np.arange(len(log) + 1)), 0.02 * random.standard_normal(len(log) + 1)], axis=1)
+    rests = Trajectory(rolls, log.actions, DT, name="rests", channels=log.channels)
+    with pytest.raises(ValueError, match="in hardly any span nothing touches"):
+        discover(simulator, Trajectories.stack([rests]))

@@ -12,12 +12,19 @@ import scipy.stats
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
-from sipe_bayes.diagnostics.agreement import LogEstimate, parts_of
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.likelihood import Noise, Segments, bind
 from sipe_bayes.posterior import GaussianMixture
 from sipe_bayes.structure.augmented import AtNoise, AugmentedModel
-from sipe_bayes.structure.discrepancy import DISCREPANCY, Discrepancy, Spread, draw_differing, find_discrepancy
+from sipe_bayes.structure.discrepancy import (
+    DISCREPANCY,
+    Discrepancy,
+    LogEstimate,
+    Spread,
+    draw_differing,
+    find_discrepancy,
+    parts_of,
+)
 from sipe_bayes.structure.single_effects import EFFECTS
 from tests.problems.pendulums import log, pendulum
 

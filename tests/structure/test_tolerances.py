@@ -60,7 +60,9 @@ def test_masses_are_allowed_the_tolerance_of_the_motor_and_said_to_be() -> None:
     assert ((low <= truth) & (truth <= high)).all()
     (noticed,) = untold(find_discrepancy(seen, TOLERANCES))
     assert noticed.code is Code.UNTOLD
-    assert "a gain of motor that is 10 % off (rod_mass by 0.05" in noticed.text
+    assert (
+        "A 10 % error of the gain of motor cannot be seen in these logs. It would bias rod_mass by 0.05" in noticed.text
+    )
 
 
 def test_the_shift_of_a_gain_has_its_sign_whichever_the_gain_has_and_its_size_on_a_log_scale() -> None:
@@ -108,7 +110,7 @@ def test_a_centre_of_mass_that_no_motion_tells_moves_mass_and_inertia_as_one_tha
     print(truth - fitted, opened.shift)
     np.testing.assert_allclose(-opened.shift, truth - fitted, rtol=0.15, atol=0.001)
     (noticed,) = untold(find_discrepancy(seen, Tolerances(geometry=0.05)))
-    assert "a centre of mass of rod that lies 5 % of its reach elsewhere" in noticed.text
+    assert "An error of the centre of mass of rod by 5 % of its reach cannot be seen" in noticed.text
     assert noticed.parameters == ("rod_mass", "armature")
     known = pendulum(Parameter("com", -0.5, 0.0, targets=("body:rod.com_z",)))  # an unknown of its own
     windows, values = Windows(Segments(0.5), known, logs), np.array([0.6, 0.08, -length])
@@ -130,7 +132,7 @@ def test_a_mass_that_is_not_asked_for_is_what_forces_and_friction_are_relative_t
     seen = AugmentedModel(windows, simulator.space.normalise(values), Noise(np.array([0.01]), np.zeros(1)))
     (opened,) = moving(seen, Tolerances(geometry=0.05))
     np.testing.assert_allclose(simulator.space.values(seen.theta + opened.shift) - values, 0.05 * values, rtol=0.1)
-    assert opened.sentence == "a mass of rod that is 5 % off"
+    assert opened.sentence == "a 5 % error of the mass of rod"
     assert moving(seen, Tolerances(timing=0.05)) == []  # there is nothing that comes late for it
 
 
@@ -143,7 +145,7 @@ def test_what_a_measurement_is_taken_later_the_delay_of_the_commands_is_shorter(
     (opened,) = moving(seen, Tolerances(timing=0.05))
     late = 0.05 * float(logs.dt[0])
     np.testing.assert_allclose(simulator.space.values(seen.theta + opened.shift)[2] - 0.02, -late, rtol=0.1)
-    assert opened.sentence.endswith("that is taken 5 % of a sample off")
+    assert opened.sentence.endswith("by 5 % of a sample")
 
 
 def test_a_configuration_says_them_all() -> None:

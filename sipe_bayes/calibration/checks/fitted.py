@@ -15,12 +15,13 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.agreement import LogEstimates, linear_estimates, log_estimates, parts_of
-from sipe_bayes.diagnostics.evaluate import LOOKED_AT, best_starts, channel_noise, white_noise
+from sipe_bayes.diagnostics.agreement import LogEstimates, linear_estimates, log_estimates
+from sipe_bayes.diagnostics.evaluate import LOOKED_AT, channel_noise, white_noise
 from sipe_bayes.diagnostics.records import ChannelNoise, LogReport
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Tell
 from sipe_bayes.likelihood import BoundLikelihood, Linearisation, Noise, StateSpace, bind
+from sipe_bayes.structure.discrepancy import parts_of
 
 
 def from_fitted_states(problem: Problem, method: Estimator) -> Problem:
@@ -85,7 +86,7 @@ class Fit:
             if chain:
                 return _At(noise, windows.no_starts())
             starts = None if method.result is None else method.result.starts_at(theta)
-            return _At(noise, best_starts(windows, theta, noise) if starts is None else starts)
+            return _At(noise, windows.fit_starts(theta, noise)[0] if starts is None else starts)
 
         at = checks.of(Check.STARTS, _At, made)
         linear = not (chain or windows.impacts or len(windows.trajectories) < 2)

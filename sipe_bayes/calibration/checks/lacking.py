@@ -15,7 +15,6 @@ from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
-from sipe_bayes.diagnostics.agreement import LogEstimate
 from sipe_bayes.diagnostics.evaluate import fitted_residuals
 from sipe_bayes.diagnostics.misfit import misfit
 from sipe_bayes.diagnostics.records import Misfit, Residual
@@ -25,7 +24,7 @@ from sipe_bayes.likelihood import QuadraticPrior, StateSpace
 from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.structure.augmented import AugmentedModel
 from sipe_bayes.structure.discover import FEWEST_APART
-from sipe_bayes.structure.discrepancy import Discrepancy, draw_differing, find_discrepancy
+from sipe_bayes.structure.discrepancy import Discrepancy, LogEstimate, draw_differing, find_discrepancy
 from sipe_bayes.structure.physics_step import PHYSICS_STEP
 
 _NAMED = 3  # numbers that no motion tells
@@ -135,13 +134,15 @@ def untold(found: Discrepancy) -> list[Finding]:
     hangs, said = np.zeros(len(space), bool), []
     for one in moving[:_NAMED]:
         ends = space.values(np.clip([logs.theta - one.shift, logs.theta, logs.theta + one.shift], 0, 1))
-        off = np.abs(np.diff(ends, axis=0)).max(0)
+        off, times = np.abs(np.diff(ends, axis=0)).max(0), np.abs(one.shift / sd)
         moved = [
-            f"{space[j].name} by {off[j]:.2g} {space[j].unit}".rstrip() for j in np.flatnonzero(one.moves(sd)).tolist()
+            f"{space[j].name} by {off[j]:.2g} {space[j].unit}".rstrip() + f" ({times[j]:.0f} posterior sd)"
+            for j in np.flatnonzero(one.moves(sd)).tolist()
         ]
-        said.append(f"{one.sentence} ({', '.join(moved)})")
+        what = one.sentence[0].upper() + one.sentence[1:]
+        said.append(f"{what} cannot be seen in these logs. It would bias {', '.join(moved)}.")
     for one in moving:
         if one.probe.extension is not PHYSICS_STEP:  # the interval allows for steps
             hangs |= one.moves(sd)
     names = [space[j].name for j in np.flatnonzero(hangs).tolist()]
-    return [finding(Code.UNTOLD, parameters=names, moved="; ".join(said))] if said else []
+    return [finding(Code.UNTOLD, parameters=names, moved=" ".join(said))] if said else []

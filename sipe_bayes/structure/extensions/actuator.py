@@ -138,7 +138,7 @@ class Gain(Extension):
 
     def off(self, site: str, share: float) -> str:
         """See ``Extension``."""
-        return f"a gain of {site} that is {100 * share:.3g} % off"
+        return f"a {100 * share:.3g} % error of the gain of {site}"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """The gain, with a normal prior of a tenth around the model's.

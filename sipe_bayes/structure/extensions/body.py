@@ -29,7 +29,7 @@ class Mass(Extension):
 
     def off(self, site: str, share: float) -> str:
         """See ``Extension``."""
-        return f"a mass of {site} that is {100 * share:.3g} % off"
+        return f"a {100 * share:.3g} % error of the mass of {site}"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """The mass, with a normal prior around the model's; none of a body whose mass is known or unknown already."""
@@ -88,7 +88,7 @@ class CentreOfMass(Extension):
 
     def off(self, site: str, share: float) -> str:
         """See ``Extension``."""
-        return f"a centre of mass of {site} that lies {100 * share:.3g} % of its reach elsewhere"
+        return f"an error of the centre of mass of {site} by {100 * share:.3g} % of its reach"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """Its place in the body's frame where it matters, with a normal prior around the model's."""

@@ -23,9 +23,6 @@ Probes = tuple[tuple[tuple[float, ...], ...], ...]
 """Theta of the parameters at which a row is tried: of each shape its directions."""
 _SPRING: Probes = (((PROBE, 0.25), (PROBE, 0.75)),)  # weak, at rest at either side: the force is a sum of the two
 _OVER_RANGES: Probes = (((PROBE, 0.2),), ((PROBE, 0.5),), ((PROBE, 0.8),))  # a little of it, over three distances
-_MOST_POWER, _FORCES = 2.5, 5.0
-_LEAST = 0.1  # of the largest command
-_SIZES = 0.9, 0.7, 0.5  # of it: a limit that is never met has no effect
 
 
 @dataclass(frozen=True)
@@ -164,8 +161,8 @@ def _one_sample(machine: Machine, parameter: Parameter) -> Probes:
 
 
 def _of_commands(machine: Machine, parameter: Parameter) -> Probes:
-    """Shares of the largest command."""
-    return tuple(((float(parameter.normalise(share * parameter.high)),),) for share in _SIZES)
+    """Shares of the largest command: a limit that is never met has no effect."""
+    return tuple(((float(parameter.normalise(share * parameter.high)),),) for share in (0.9, 0.7, 0.5))
 
 
 _LUGRE = 'actuator/dcmotor with input="none", LuGre friction'
@@ -323,7 +320,7 @@ _ROWS = (
     ),
     Row(  # of an actuator whose force hangs on the motion too; elsewhere it is a limit of the force
         "command_limit", "actuator", "a limit of the command of {}", "MuJoCo documentation, actuator ctrlrange",
-        (Unknown("command_limit", lambda s: _LEAST * s.command, lambda s: s.command, "largest command either way"),),
+        (Unknown("command_limit", lambda s: 0.1 * s.command, lambda s: s.command, "largest command either way"),),
         tried=_of_commands,
         needs=lambda machine, site: bool(machine.commands[site]) and machine.is_position(site),
     ),
@@ -345,10 +342,10 @@ _ROWS = (
         "power", "actuator", "a force of {} that goes with a power of its command", _FOSSEN,
         (
             Unknown(
-                "exponent", 1 / _MOST_POWER, _MOST_POWER, "power of the command that the force goes with", scale="log"
+                "exponent", 1 / 2.5, 2.5, "power of the command that the force goes with", scale="log"
             ),
             Unknown(
-                "exponent_force", lambda s: s.force / _FORCES, lambda s: s.force * _FORCES,
+                "exponent_force", lambda s: s.force / 5, lambda s: 5 * s.force,
                 "force that is the model's whatever the power", scale="log",
             ),
         ),

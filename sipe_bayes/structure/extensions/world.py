@@ -103,7 +103,7 @@ class SensorDelay(Extension):
 
     def off(self, site: str, share: float) -> str:
         """See ``Extension``."""
-        return f"a measurement {_short(site)} that is taken {100 * share:.3g} % of a sample off"
+        return f"an error of the time stamps of {_short(site)} by {100 * share:.3g} % of a sample"
 
     def memory(self, dt: float) -> float:
         """The longest delay."""
