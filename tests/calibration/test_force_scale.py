@@ -12,7 +12,7 @@ from sipe_bayes.calibration.force_scale import find_open_scale
 from sipe_bayes.cli.app import main
 from tests.problems.lacking import write_lacking
 
-GAIN = '[[parameters]]\nname = "gain"\ntarget = "actuator:motor.gain"\nbounds = [{}, 2.0]\n'
+GAIN = '[[parameters]]\nname = "gain"\ntarget = "actuator:motor.gain"\nbounds = [{}, {}]\n'
 DAMPING = '\n[[parameters]]\nname = "damping"\ntarget = "joint:hinge.damping"\nbounds = [0.0, 0.2]\n'
 
 
@@ -27,11 +27,11 @@ def configuration(folder: Path, gain: str, prior: str = "", damped: bool = True)
 @pytest.mark.parametrize(
     ("gain", "prior", "damped", "asked"),
     [
-        (GAIN.format(0.5), "", True, True),
+        (GAIN.format(0.5, 2.0), "", True, True),
         ("", "", True, False),  # the force is known
-        (GAIN.format(0.5), "", False, False),  # the damping is
-        (GAIN.format(0.5), "prior = { mean = 0.6, sd = 0.01 }\n", True, False),  # the mass was weighed
-        (GAIN.format(1.9), "", True, False),  # the bounds say about as much
+        (GAIN.format(0.5, 2.0), "", False, False),  # the damping is
+        (GAIN.format(0.5, 2.0), "prior = { mean = 0.6, sd = 0.01 }\n", True, False),  # the mass was weighed
+        (GAIN.format(0.95, 1.05), "", True, False),  # the bounds say about as much
     ],
 )
 def test_a_scale_is_open_where_all_forces_and_masses_are_free(
@@ -44,7 +44,7 @@ def test_a_scale_is_open_where_all_forces_and_masses_are_free(
 def test_the_question_stands_before_the_first_estimate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config = configuration(tmp_path, GAIN.format(0.5))
+    config = configuration(tmp_path, GAIN.format(0.5, 2.0))
     words = ["sipe", "calibrate", str(config), "--threads", "1", "--out", str(tmp_path / "o"), "--time-limit", "1"]
     monkeypatch.setattr(sys, "argv", words)
     with pytest.raises(SystemExit):

@@ -83,10 +83,13 @@ def paced(monkeypatch: pytest.MonkeyPatch, *done: tuple[int, float]) -> list[str
     return shown
 
 
+def words_of(config: Path) -> list[str]:
+    return ["sipe", "discover", str(config), "--threads", "1", "--out", str(config.parent / "o")]
+
+
 def interrupted(config: Path, during: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The command, which ends as what was interrupted does."""
-    words = ["sipe", "discover", str(config), "--threads", "1", "--out", str(config.parent / "o")]
-    monkeypatch.setattr("sys.argv", words)
+    monkeypatch.setattr("sys.argv", words_of(config))
     monkeypatch.setattr(during, _interrupted)
     with pytest.raises(SystemExit) as left:
         main()
@@ -104,7 +107,7 @@ def test_an_interrupted_search_answers_with_what_it_has(
     folder = config.parent / "o"
     assert {"report.html", "structures.json", "discovered.xml"} <= {file.name for file in folder.iterdir()}
     monkeypatch.undo()
-    monkeypatch.setattr("sys.argv", ["sipe", "discover", str(config), "--threads", "1", "--out", str(folder)])
+    monkeypatch.setattr("sys.argv", words_of(config))
     with pytest.raises(SystemExit, match="0"):
         main()
     assert "when it was interrupted" not in capsys.readouterr().out
@@ -126,12 +129,11 @@ def test_a_time_limit_ends_a_search_with_what_it_has(
     config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """No time at all: the model as it is is fitted, nothing more."""
-    words = ["sipe", "discover", str(config), "--threads", "1", "--out", str(config.parent / "o"), "--time-limit", "0"]
-    monkeypatch.setattr("sys.argv", words)
+    monkeypatch.setattr("sys.argv", [*words_of(config), "--time-limit", "0"])
     with pytest.raises(SystemExit, match="0"):
         main()
     shown = " ".join(capsys.readouterr().out.split())
-    assert "the search ended at its time limit before any piece was tried" in shown
+    assert "the search ended at its time limit before the model as it is was fitted to the end" in shown
     assert "give a longer --time-limit, and the same folder goes on" in shown
 
 

@@ -187,7 +187,7 @@ def test_what_the_model_lacks_says_where_values_would_be(calibration: Calibratio
     impacts = dataclasses.replace(calibration, findings=(noticed(Code.MISFIT_NOT_ASKED, severity=Severity.NOTE),))
     assert judged.lack(impacts) == judged.Verdict(
         "fair",
-        "Whether the model lacks something was not asked: segments meet impacts.",
+        "It was not asked whether the model lacks something: bodies touch in most segments.",
     )
 
 

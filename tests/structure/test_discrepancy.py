@@ -62,7 +62,6 @@ def test_of_a_right_model_they_are_hardly_wider_and_hold_the_truth() -> None:
     recorded = [log(pendulum(), [0.6, 0.08], seed, name=f"log {seed}") for seed in range(6)]
     theta = pendulum().space.normalise(np.array([0.6, 0.08]))
     seen, plain, wide = of_logs(recorded)
-    print(plain, wide, seen.causes)
     assert ((wide[0] <= theta) & (theta <= wide[1])).all()
     assert (wide[1] - wide[0] < 1.3 * (plain[1] - plain[0])).all()
     assert seen.causes == ()
@@ -119,24 +118,10 @@ def test_sds_are_the_scatter_whether_samples_remember_or_not(memory: float) -> N
         steps.append(logs.seen.projected.base)
         plain.append(np.sqrt(np.diag(logs.seen.projected.covariance)))
         discounted.append(np.sqrt(np.diag(logs.seen.discounted.projected.covariance)))
-    seen = np.std(steps, axis=0)
-    print(seen / np.mean(plain, axis=0), seen / np.mean(discounted, axis=0))
-    assert (seen / np.mean(discounted, axis=0) < 1.5).all()
-    assert (seen / np.mean(discounted, axis=0) > 0.6).all()
-    ratio = seen / np.mean(plain, axis=0)
+    told, ratio = (np.std(steps, axis=0) / np.mean(sds, axis=0) for sds in (discounted, plain))
+    print(told, ratio)
+    assert ((told > 0.6) & (told < 1.5)).all()
     assert (ratio > 2.5).all() if memory > 1 else (ratio < 1.3).all()
-
-
-def test_a_posterior_is_stretched_as_its_samples_remember() -> None:
-    for memory, least, most in ((1.0, 0.95, 1.5), (15.0, 2.3, 10.0)):
-        logs = probed(memory, 1)
-        covariance = np.diag(np.diag(logs.seen.projected.covariance))
-        fitted = GaussianMixture(np.zeros(1), logs.theta[None], covariance[None], pendulum().space)
-        ends = [p.quantile([0.25, 0.75]).numpy() for p in (fitted, find_discrepancy(logs).draw(fitted, 0))]
-        ratio = np.diff(ends[1], axis=0)[0] / np.diff(ends[0], axis=0)[0]
-        print(memory, ratio)
-        assert (ratio > least).all()
-        assert (ratio < most).all()
 
 
 def test_of_logs_without_extensions_only_what_differs_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,9 +130,7 @@ def test_of_logs_without_extensions_only_what_differs_is_allowed(monkeypatch: py
     logs, theta = linearised().windows, linearised().theta
     bare = AugmentedModel(logs, theta, Noise(np.array([SD]), np.zeros(1)))
     seen = find_discrepancy(bare)
-    assert bare.probes == []
-    assert seen.effects is None
-    assert seen.causes == ()
+    assert (bare.probes, seen.effects, seen.causes) == ([], None, ())
     fitted = GaussianMixture(np.zeros(1), theta[None], 1e-4 * np.eye(2)[None], pendulum().space)
     assert np.isfinite(seen.draw(fitted, 0).theta.numpy()).all()
 

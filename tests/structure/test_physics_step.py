@@ -146,18 +146,6 @@ def test_a_machine_without_steps_is_told_from_one_with_the_models(step: float, s
         assert ((low <= values) & (values <= high)).all()
 
 
-def test_what_steps_do_is_taken_back_once() -> None:
-    """By what the logs tell of it: the plain estimate of the damping is a sd and a half too small."""
-    logs, drawn, values = fitted(DT / 20, 3)
-    (k,) = (k for k, probe in enumerate(logs.probes) if probe.extension is PHYSICS_STEP)
-    plain, sd = drawn.mean.numpy(), drawn.stddev.numpy()
-    shift = (find_discrepancy(logs, ALLOWED).draw(drawn, 0).mean.numpy() - plain) / sd
-    whole = -logs.seen.projected.answer[:, k] * logs.probes[k].whole / sd
-    print(shift, whole, (values - plain) / sd)
-    assert whole[1] > 1.2
-    np.testing.assert_allclose(shift, whole, atol=0.8)
-
-
 def test_a_step_of_which_the_logs_tell_is_not_untold() -> None:
     """Whichever sign its size seems to have, in logs in the model's own steps."""
     signs = set()
