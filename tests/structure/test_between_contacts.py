@@ -44,7 +44,6 @@ def test_drag_is_found_in_flight_and_only_where_there_is_some(drag: float, found
     logs = Trajectories.stack([dropped(drag, seed) for seed in (1, 2)])
     assert bind(Segments(0.5), ball(), logs).impacts
     structures = discover(ball(), logs, restriction=Restriction(only=("viscous_friction", "dry_friction", "spring")))
-    print(structures.table())
     assert bool(structures.best.labels) == found
     if found:
         assert any(label.startswith("viscous_friction") for label in structures.best.labels)
