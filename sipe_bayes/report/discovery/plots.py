@@ -90,7 +90,10 @@ def _correlation(ax: Axes, row: Residual, colour: str) -> None:
 
 @styled
 def values(discovery: Discovery) -> list[Figure]:
-    """The user's parameters, those of single logs aside: 90 % intervals before, and stacked over structures."""
+    """The user's parameters, those of single logs aside: 90 % intervals before, and stacked over structures.
+
+    Where there are discrepancy-aware ones, these are thin lines that hold the others.
+    """
     plain = {p.name: p for p in discovery.plain_parameters}
     pairs = [(plain[p.name], p) for p in discovery.parameters if not p.nuisance]
     return [_value_figure(part) for part in equal_parts(pairs, SIZES.parameters)]
@@ -102,12 +105,15 @@ def _value_figure(rows: Sequence[tuple[ParameterSummary, ParameterSummary]]) -> 
         for height, (p, colour) in enumerate(zip(pair, (DEFAULT, POSTERIOR), strict=True)):
             ax.plot([p.q05, p.q95], [1 - height] * 2, color=colour, lw=2.5, solid_capstyle="butt")
             ax.plot(p.q50, 1 - height, "o", color=colour, ms=5)
+            if p.further is not None:
+                ax.plot(p.further, [1 - height] * 2, color=colour, lw=1)
         ax.set_ylim(-0.7, 1.7)
         ax.set_yticks([])
         ax.spines["left"].set_visible(False)
         ax.set_title(with_unit(shortened(pair[0].name, 30), pair[0].unit), loc="left")
         ticks(ax.xaxis, 4)
-    legend_above(
-        figure, [line_handle(DEFAULT, BEFORE, lw=2.5), line_handle(POSTERIOR, "stacked over structures", lw=2.5)], 2
-    )
+    handles = [line_handle(DEFAULT, BEFORE, lw=2.5), line_handle(POSTERIOR, "stacked over structures", lw=2.5)]
+    if any(p.further is not None for _, p in rows):
+        handles.append(line_handle(POSTERIOR, "with what the model lacks", lw=1))
+    legend_above(figure, handles, 3)
     return figure
