@@ -80,6 +80,7 @@ class Projected:
         answer: (N, K): by how much theta moves back for one of each.
         covariance: (N, N) of theta; zero of parameters that the search left on their bounds.
         base: (N,) step of theta without probes.
+        pressed: (N,) how far beyond its bound each parameter would go by itself that a bound holds; else zero.
     """
 
     information: FloatArray
@@ -88,6 +89,7 @@ class Projected:
     answer: FloatArray
     covariance: FloatArray
     base: FloatArray
+    pressed: FloatArray
 
 
 @dataclass(frozen=True)
@@ -264,7 +266,10 @@ class AtNoise:
         answer = covariance @ cross
         information = arrow.precision[n:, n:] - cross.T @ answer
         score = arrow.gradient[n:] - cross.T @ base
-        return Projected(information, score, np.diag(arrow.precision)[n:], answer, covariance, base)
+        pull = arrow.gradient[:n] + logs.pull - cross @ self.sizes
+        own = np.maximum(np.diag(arrow.precision[:n, :n] + logs.inner), 1e-300)
+        pressed = np.where(self.free, 0.0, pull / own)
+        return Projected(information, score, np.diag(arrow.precision)[n:], answer, covariance, base, pressed)
 
     def left(self, sizes: FloatArray) -> FloatArray:
         """What is left of the residual (W, L, C) where the probes have sizes (K,) and all else follows."""

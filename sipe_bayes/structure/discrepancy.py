@@ -109,7 +109,7 @@ class Discrepancy:
         sizes += known
         share = np.maximum(1 + DISCREPANCY.reach * random.standard_normal((count, 1)), 0.0)
         released = made.base - logs.seen.projected.base  # of parameters that come away from their bounds
-        moved = released + share * (logs.traded(single) - sizes @ made.answer.T)
+        moved = released + share * (logs.traded(single) - sizes @ made.answer.T + made.pressed)
         return _holding(self._stretched(posterior, random) + moved, posterior)
 
     def _stretched(self, posterior: Posterior, random: np.random.Generator) -> FloatArray:
@@ -211,8 +211,11 @@ def draw_differing(posterior: Posterior, logs: Sequence[LogEstimate], seed: int)
 
 
 def _holding(theta: FloatArray, posterior: Posterior) -> Particles:
-    """Draws (M, N), each parameter's mapped so that its 90 % interval holds the posterior's."""
-    theta = np.clip(theta, 0, 1)
+    """Draws (M, N), folded into the cube, each parameter's mapped so that its 90 % interval holds the posterior's.
+
+    What lies beyond a bound by so much lies as far within: by that much at least the linear model is wrong.
+    """
+    theta = np.clip(np.where(theta > 1, 2 - theta, np.abs(theta)), 0, 1)
     inner = posterior.quantile(torch.tensor(_ENDS, dtype=torch.float64)).numpy()
     for j, (low, high) in enumerate(inner.T):
         own = np.quantile(theta[:, j], _ENDS)
