@@ -103,9 +103,8 @@ class Discrepancy:
         sizes = single + every
         known = self.known.draws(sizes, random)
         if not self.is_doubted:
-            known[:, ~asked(self.at) & ~np.array([probe.extension is PHYSICS_STEP for probe in logs.probes], bool)] = (
-                0.0
-            )
+            steps = np.array([probe.extension is PHYSICS_STEP for probe in logs.probes], bool)
+            known[:, ~asked(self.at) & ~steps] = 0.0
         sizes += known
         share = np.maximum(1 + DISCREPANCY.reach * random.standard_normal((count, 1)), 0.0)
         released = made.base - logs.seen.projected.base  # of parameters that come away from their bounds
