@@ -213,7 +213,10 @@ class _Model:
 
     def further(self, seed: int) -> Particles | None:
         """Of all parameters that a further log would ask for; None where that cannot be said."""
-        return None if self.found is None else self.found.draw(self.structures.posterior_of(self.one), seed)
+        try:
+            return None if self.found is None else self.found.draw(self.structures.posterior_of(self.one), seed)
+        except ValueError:  # a finished search is not lost to its last check
+            return None
 
     def stage(self, seed: int) -> Stage:
         """What it leaves of the training logs."""

@@ -38,11 +38,8 @@ def find_open_scale(problem: Problem) -> tuple[str, ...]:
     log = problem.train[0]
     steps = int(min(len(log), np.ceil(1.0 / log.dt)))  # a second is enough for what changes nothing at all
     state = first_states(problem.simulator, Trajectories.stack([log]))
-    theta = space.normalise(values)
-    actions = np.tile(log.actions[:steps], (3, 1, 1))
-    runs = problem.simulator.rollout(
-        theta, actions, np.repeat(state, 3, axis=0), dt=log.dt, logs=[log.name] * 3, allow_outside=True
-    )
+    given = space.normalise(values), np.tile(log.actions[:steps], (3, 1, 1)), np.repeat(state, 3, axis=0)
+    runs = problem.simulator.rollout(*given, dt=log.dt, logs=[log.name] * 3, allow_outside=True)
     seen = np.asarray(runs.observations)
     together, alone = (np.sqrt(np.nanmean((seen[k] - seen[0]) ** 2, axis=0)) for k in (1, 2))
     moves = alone > 1e-9

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sipe_bayes.core.checkpoint import load_state, save_state
-from sipe_bayes.core.trajectory import Trajectories
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import MOST_ROLLOUTS, cores, nearest_name, whole
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.recorded import Progress, digest
@@ -112,7 +112,7 @@ def discover(
 
     Raises:
         ValueError: for a simulator of anything but an MJCF, unknown extensions, sites that the model does not have, or
-            logs in hardly any span of which nothing touches.
+            logs in which bodies touch nearly all the time.
         CheckpointError: for a checkpoint that is damaged or of another run.
         SearchInterrupted: with what the search has, where it is interrupted.
     """
@@ -222,25 +222,23 @@ def _between_contacts(fitting: Fitting, simulator: Simulator) -> Fitting:
     environment = fitting.environment
     if environment.added or any(parameter.log is not None for parameter in environment.parameters):
         raise ValueError(
-            "logs: bodies strike or slip along them, and what holds for single logs is not told between contacts; "
-            "search without weighed loads and parameters of single logs"
+            "logs: bodies strike or slip along them, so that only spans without contact are searched; leave out known "
+            "loads and parameters of single logs, which these spans do not have"
         )
-    both = [fitting.windows(simulator).spans_apart(LEAST_SPAN)]
+    train, held = fitting.windows(simulator).spans_apart(LEAST_SPAN), list[Trajectory]()
     if fitting.holdout is not None:
-        both.append(BoundLikelihood(fitting.likelihood, simulator, fitting.holdout).spans_apart(LEAST_SPAN))
-    if sum(len(span) for span in both[0]) < FEWEST_APART * LEAST_SPAN:
+        held = BoundLikelihood(fitting.likelihood, simulator, fitting.holdout).spans_apart(LEAST_SPAN)
+    if sum(len(span) for span in train) < FEWEST_APART * LEAST_SPAN:
         raise ValueError(
-            "logs: in hardly any span nothing touches, and fits of two structures through impacts do not compare; "
-            "add what you suspect as parameters, fit with likelihood = 'state_space', and compare held-out errors"
+            "logs: bodies touch nearly all the time, and structures cannot be compared through impacts; add what you "
+            "suspect as parameters, fit with likelihood = 'state_space', and compare held-out errors"
         )
     window = fitting.likelihood.window
-    short = [(span.name, None) for spans in both for span in spans if window and len(span) * span.dt < window]
-    train, *held = (Trajectories.stack(spans) if spans else None for spans in both)
-    assert train is not None
+    short = [(span.name, None) for span in (*train, *held) if window and len(span) * span.dt < window]
     return replace(
         fitting,
-        trajectories=train,
-        holdout=held[0] if held else None,
+        trajectories=Trajectories.stack(train),
+        holdout=Trajectories.stack(held) if held else None,
         likelihood=replace(fitting.likelihood, windows=tuple(short)),
         spans=True,
     )

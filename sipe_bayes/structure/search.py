@@ -185,7 +185,7 @@ class StructureSearch:
             rests = set(np.array(windows.fitted)[~shown].tolist())
             share = {name: left.get(name, 0.0) for name in share if name not in rests}
         columns, tried, spent, number = choices(channels, share), [], 0, 0
-        # without a plain model there is nothing else to spend the budget on; late, what was tried is tried again
+        # without a plain model there is nothing else to spend the budget on
         most = self.budget if plain is None else options.column_share * (self.budget - plain.rollouts)
         while number < len(columns) and spent + options.column_budget <= most and not self.is_late:
             column, number = columns[number], number + 1
@@ -199,6 +199,8 @@ class StructureSearch:
         if plain is None and not tried:
             plain = given.fit([], None, self.enough([]))  # or what keeps the plain model from being fitted is raised
             return replace(state, fitted=(plain,), column_rollouts=spent)
+        if plain is not None and self.is_late and number < len(columns):  # the same search tries them again
+            return replace(state, column_rollouts=spent, cut=Phase.COLUMNS)
         best = max(tried, key=lambda item: item[0], default=None)
         if best is None or (plain is not None and best[0] < plain.evidence + options.column_gain):
             return replace(state, column_rollouts=spent, untried=tuple(columns[number:]))

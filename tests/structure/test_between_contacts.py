@@ -73,5 +73,5 @@ def test_what_touches_all_along_is_refused_in_one_line() -> None:
     log, random = dropped(0.0, 1), np.random.default_rng(0)
     rolls = np.stack([0.3 * np.sin(0.1 * np.arange(len(log) + 1)), 0.02 * random.standard_normal(len(log) + 1)], axis=1)
     rests = Trajectory(rolls, log.actions, DT, name="rests", channels=log.channels)
-    with pytest.raises(ValueError, match="in hardly any span nothing touches"):
+    with pytest.raises(ValueError, match="bodies touch nearly all the time"):
         discover(simulator, Trajectories.stack([rests]))

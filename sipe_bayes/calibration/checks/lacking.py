@@ -27,7 +27,7 @@ from sipe_bayes.structure.discover import FEWEST_APART
 from sipe_bayes.structure.discrepancy import Discrepancy, LogEstimate, draw_differing, find_discrepancy
 from sipe_bayes.structure.physics_step import PHYSICS_STEP
 
-_NAMED = 3  # numbers that no motion tells
+_NAMED = 3  # numbers whose error the logs do not show
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def _found(problem: Problem, fit: Fit, unknown: list[Finding], tell: Tell, kept:
         if logs.windows.num_windows < fit.windows.num_windows:
             asked, every = logs.windows.num_windows, fit.windows.num_windows
             unknown.append(finding(Code.CHECKS_THINNED, asked=asked, windows=every))
-        tell("extensions that may be at work")
+        tell("which extensions explain the residuals")
         found = find_discrepancy(logs, problem.tolerances)
         unknown.extend(untold(found))
     except ValueError as error:  # LinAlgError is one
