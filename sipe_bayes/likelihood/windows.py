@@ -464,8 +464,12 @@ class Windows:
         """Rollouts of each log that ``fit_starts`` takes at most."""
         return 1 + _ITERATIONS * (self.num_start + len(_SHORTER))
 
-    def fit_starts(self, theta: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray, bool]:
-        """Starts (W, D) that minimise the whitened residuals at a fixed theta (N,).
+    def fit_starts(
+        self, theta: FloatArray, noise: Noise, starts: FloatArray | None = None, most: int = _ITERATIONS
+    ) -> tuple[FloatArray, FloatArray, bool]:
+        """Starts (W, D) that minimise the whitened residuals at a fixed theta (N,), each window by itself.
+
+        starts: near which they are searched; default the measured ones. most: steps.
 
         Returns:
             Them, the residuals (W, L, C) from them, and whether that simulation is valid.
@@ -475,19 +479,29 @@ class Windows:
             residual, valid = self.residuals(theta[None], starts[None])
             return residual[0], bool(valid[0])
 
-        starts = self.no_starts()
+        def energies(starts: FloatArray, residual: FloatArray) -> FloatArray:
+            rows = zip(self.whitened(residual[None], noise), self.sequences, strict=True)
+            squares = [np.bincount(s.window, r[0] ** 2, minlength=len(starts)) for r, s in rows]
+            return np.asarray(sum(squares)) + starts**2 @ self.start_precision
+
+        starts = self.no_starts() if starts is None else starts
         residual, valid = simulated(starts)
-        for _ in range(_ITERATIONS if valid and np.isfinite(residual).all() else 0):
+        energy = energies(starts, residual)
+        for _ in range(most if valid and np.isfinite(residual).all() else 0):
             linearisation = self.linearise(theta, starts, with_theta=False, residual=residual)
             move = self.log_density(self.moments(linearisation), noise, starts)[1]
-            before = after = self.chi_square(residual[None], noise)[0]
+            before, rest = energy.sum(), np.ones(len(starts), bool)
             for share in _SHORTER:
-                tried, good = simulated(starts + share * move)
-                after = self.chi_square(tried[None], noise)[0] if good else np.inf
-                if after < before:
-                    starts, residual = starts + share * move, tried
+                tried = np.where(rest[:, None], starts + share * move, starts)
+                left, good = simulated(tried)
+                after = energies(tried, left) if good else np.full(len(starts), np.inf)
+                better = rest & (after < energy)
+                starts = np.where(better[:, None], tried, starts)
+                residual, energy = np.where(better[:, None, None], left, residual), np.where(better, after, energy)
+                rest &= ~better & (before > 0)
+                if not rest.any():
                     break
-            if not after < (1 - _SETTLED) * before:
+            if not energy.sum() < (1 - _SETTLED) * before:
                 break
         return starts, residual, valid
 

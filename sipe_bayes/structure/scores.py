@@ -24,15 +24,20 @@ Deviations:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import ndtr
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.likelihood import FLAT_PRECISION, BoundLikelihood, Noise, QuadraticPrior
+from sipe_bayes.likelihood.block_tridiagonal import damped_box_step
 from sipe_bayes.posterior.truncated_normal import TruncatedNormal
 
 _PIECES = 40  # of all logs together, at most
+_STEPS = 8  # in which initial states are fitted to other samples than those of the fit; most take two
+_CUT_OFF = 1e-3  # of a parameter's normal by the cube, which may be left out
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,7 @@ class Scores:
 def scores(
     windows: BoundLikelihood, theta: FloatArray, starts: FloatArray, noise: Noise, prior: QuadraticPrior
 ) -> Scores:
-    """Both scores of an optimum; costs a linearisation.
+    """Both scores of an optimum; costs a linearisation, and a search for initial states where sensors may be late.
 
     Args:
         windows: the logs, W windows.
@@ -81,6 +86,8 @@ def scores(
         ValueError: where the simulation diverges.
     """
     own, windows = windows, windows.compared_late()
+    if windows is not own and windows.num_start:  # which are compared on other samples than those of the fit
+        starts = windows.fit_starts(theta, noise, starts, _STEPS)[0]
     linearisation = windows.linearise(theta, starts)
     own.rollouts += windows.rollouts if windows is not own else 0
     if not linearisation.valid:
@@ -88,23 +95,26 @@ def scores(
     # one block for each window also where starts are known
     moments = windows.moments(linearisation)
     products, constants = moments.normal(noise), _log_determinants(windows, noise)
-    evidence = _Linear(windows, theta, starts, prior).evidence(products, float(constants.sum()))
+    linear, products = _Linear(windows, theta, starts, prior).centred(products)
+    evidence = linear.evidence(products, float(constants.sum()))
     parts = _parts(windows)
     if len(parts) < 2 or len(products) < len(windows.log):
         every = [np.ones(windows.num_windows, bool)]
         return Scores(evidence, _pieces(windows, every, np.array([evidence]), constants))
     windows = windows.cut(np.array([part.argmax() for part in parts]))
     products, constants = windows.moments(linearisation).normal(noise), _log_determinants(windows, noise)
-    linear = _Linear(windows, theta, starts, prior)
+    linear, products = _Linear(windows, theta, starts, prior).centred(products)
     whole = linear.evidence(products, float(constants.sum()))
     without = [linear.evidence_of(products, constants, ~part) for part in parts]
     return Scores(evidence, _pieces(windows, parts, whole - np.array(without), constants))
 
 
 def predictive(windows: BoundLikelihood, theta: FloatArray, noise: Noise, posterior: QuadraticPrior) -> Pieces:
-    """Pieces of held-out logs; costs two linearisations. Minus infinity where a simulation diverges.
+    """Pieces of held-out logs, minus infinity where a simulation diverges.
 
-    The starts are those that fit best to first order; the noise is that of the held-out logs themselves, since a
+    Costs a linearisation and a search for initial states.
+
+    The starts are those that fit best; the noise is that of the held-out logs themselves, since a
     model's error differs from motion to motion.
 
     Args:
@@ -115,10 +125,7 @@ def predictive(windows: BoundLikelihood, theta: FloatArray, noise: Noise, poster
     """
     own, windows = windows, windows.compared_late()
     parts = _parts(windows) if windows.num_start else [np.ones(windows.num_windows, bool)]  # known starts: one block
-    starts = windows.no_starts()
-    begun = windows.linearise(theta, starts, with_theta=False)
-    if begun.valid:
-        starts = starts + windows.log_density(windows.moments(begun), noise, starts)[1]
+    starts = windows.fit_starts(theta, noise, most=_STEPS)[0] if windows.num_start else windows.no_starts()
     linearisation = windows.linearise(theta, starts)
     own.rollouts += windows.rollouts if windows is not own else 0
     if not linearisation.valid:
@@ -137,12 +144,46 @@ def predictive(windows: BoundLikelihood, theta: FloatArray, noise: Noise, poster
 
 @dataclass(frozen=True)
 class _Linear:
-    """The linear model around theta (N,) and starts (W, D)."""
+    """The linear model around theta (N,) and starts (W, D).
+
+    untaken: the step (N,) that the linear model asks for and the search did not take; None where it may be taken.
+    """
 
     windows: BoundLikelihood
     theta: FloatArray
     starts: FloatArray
     prior: QuadraticPrior
+    untaken: FloatArray | None = None
+
+    def centred(self, products: FloatArray) -> tuple[_Linear, FloatArray]:
+        """The model, and whitened products (W, K, K), whose optimum within the cube is where it stands.
+
+        The search ended there, so where simulations are rough a gain that slopes still promise is none.
+        """
+        n, solved = len(self.theta), self.windows.eliminate(products, len(self.theta), self.starts)
+        if not n:
+            return self, products
+        precision = solved.precision + self._inner
+        move = damped_box_step(precision, solved.gradient + self._pull, self.theta, 0.0)
+        own, d = solved.blocks(move), self.windows.num_start
+        step = np.concatenate([np.tile(move, (len(products), 1)), own, np.roll(own, 1, axis=0)], axis=1)
+        change = np.einsum("wij,wj->wi", products[:, :-1, :-1], step)
+        change[:, n : n + d] += own * self.windows.start_precision
+        products = products.copy()
+        products[:, :-1, -1] -= change
+        products[:, -1, :-1] -= change
+        return replace(self, untaken=move), products
+
+    @property
+    def _inner(self) -> FloatArray:
+        """Precision (N, N) of the prior, with directions closed."""
+        return self.prior.precision + FLAT_PRECISION * np.eye(len(self.theta))
+
+    @property
+    def _pull(self) -> FloatArray:
+        """Of the prior (N,)."""
+        pull = self.prior.pull(self.theta) + FLAT_PRECISION * (0.5 - self.theta)
+        return pull if self.untaken is None else pull - self._inner @ self.untaken
 
     def evidence_of(self, products: FloatArray, constants: FloatArray, which: BoolArray) -> float:
         """Log p of the rows of some windows (W,) alone."""
@@ -155,26 +196,35 @@ class _Linear:
         starts = float((self.starts**2 @ precision).sum()) - solved.explained + solved.log_determinant
         starts -= len(self.starts) * float(np.log(precision).sum())
         level = -0.5 * (constant + float(products[:, -1, -1].sum()) + starts) - self.prior.energy(self.theta)
-        flat = FLAT_PRECISION * np.eye(n)
-        precision = solved.precision + self.prior.precision + flat
-        gradient = solved.gradient + self.prior.pull(self.theta) + FLAT_PRECISION * (0.5 - self.theta)
+        precision = solved.precision + self._inner
+        gradient = solved.gradient + self._pull
         covariance = np.linalg.inv(0.5 * (precision + precision.T))
         step = covariance @ gradient
         log_det = float(np.linalg.slogdet(precision)[1])
-        mass = TruncatedNormal(self.theta + step, 0.5 * (covariance + covariance.T)).log_mass if n else 0.0
+        mass = _log_mass(self.theta + step, 0.5 * (covariance + covariance.T))
         around = 0.5 * float(gradient @ step) - 0.5 * log_det + 0.5 * n * float(np.log(2 * np.pi)) + mass
-        return level + around - _log_prior_integral(self.prior)
+        return level + around - self._log_prior_integral
+
+    @functools.cached_property
+    def _log_prior_integral(self) -> float:
+        """Log of the integral of exp(-energy) over the cube; parameters without precision are uniform."""
+        own = np.flatnonzero(np.diag(self.prior.precision) > 0)
+        precision = self.prior.precision[np.ix_(own, own)]
+        mass = _log_mass(self.prior.mean[own], np.asarray(np.linalg.inv(precision), float))
+        return 0.5 * len(own) * float(np.log(2 * np.pi)) - 0.5 * float(np.linalg.slogdet(precision)[1]) + mass
 
 
-def _log_prior_integral(prior: QuadraticPrior) -> float:
-    """Log of the integral of exp(-energy) over the cube; parameters without precision are uniform."""
-    own = np.flatnonzero(np.diag(prior.precision) > 0)
-    if not len(own):
-        return 0.0
-    precision = prior.precision[np.ix_(own, own)]
-    covariance: FloatArray = np.asarray(np.linalg.inv(precision), float)
-    mass = TruncatedNormal(prior.mean[own], covariance).log_mass
-    return 0.5 * len(own) * float(np.log(2 * np.pi)) - 0.5 * float(np.linalg.slogdet(precision)[1]) + mass
+class _RoughMass(TruncatedNormal):
+    """Of a mass that is known to a hundredth of a nat: evidences are compared by nats."""
+
+    points = 2**8
+
+
+def _log_mass(mean: FloatArray, covariance: FloatArray) -> float:
+    """Log of a normal's mass in the cube, by the parameters (N,) of which that cuts off more than a thousandth."""
+    sd = np.sqrt(np.diag(covariance))
+    cut = np.flatnonzero(ndtr(-mean / sd) + ndtr((mean - 1) / sd) > _CUT_OFF)
+    return _RoughMass(mean[cut], covariance[np.ix_(cut, cut)]).log_mass
 
 
 def _log_determinants(windows: BoundLikelihood, noise: Noise) -> FloatArray:

@@ -302,7 +302,9 @@ class StructureSearch:
     def _fit(self, state: DiscoverState) -> DiscoverState:
         labels, *rest = state.queue
         offer = next(o for o in reversed(state.offers) if self._grown(o) == labels)
-        state = self._fitted(state, labels, np.concatenate([offer.others, offer.theta]))
+        near = state.of(offer.at)
+        assert near is not None
+        state = self._fitted(state, labels, np.concatenate([offer.others, offer.theta]), near)
         if state.cut is not None:
             return state
         state = replace(state, queue=tuple(rest))
@@ -328,7 +330,7 @@ class StructureSearch:
             if labels not in state.pruned and labels not in state.failed:
                 keep = [i for i, label in enumerate(self._owners(best)) if label in (None, *labels)]
                 before, failed = state.of(labels), state.failed
-                state = self._fitted(state, labels, best.theta[keep])
+                state = self._fitted(state, labels, best.theta[keep], best)
                 if before is not None:  # a failure says nothing then
                     state = replace(state, fitted=_merged(state.fitted, before), failed=failed)
                 return replace(state, pruned=(*state.pruned, labels))
@@ -341,7 +343,7 @@ class StructureSearch:
             return state
         if ranked and ranked[0].gain > self.options.least_gain:
             labels = (*here.labels, ranked[0].placed.label)
-            state = self._fitted(state, labels, np.concatenate([here.theta, ranked[0].theta]))
+            state = self._fitted(state, labels, np.concatenate([here.theta, ranked[0].theta]), here)
         return replace(state, phase=Phase.DONE)
 
     def _owners(self, one: FittedStructure) -> list[str | None]:
@@ -350,13 +352,17 @@ class StructureSearch:
         own: list[str | None] = [None] * count
         return own + [label for label in one.labels for _ in self._placed[label].parameters]
 
-    def _fitted(self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray) -> DiscoverState:
+    def _fitted(
+        self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray, near: FittedStructure
+    ) -> DiscoverState:
+        """A structure fitted from the initial states of a similar one."""
         left, cut = self._left(state), None
         self._rollouts, self._fit_rollouts = state.rollouts, 0
         try:
             most = self.enough(labels)
             cut = state.phase if left < most else None
-            one = self.fitting.fit(self.structure(labels), initial, max(min(most, left), 1), self._tell)
+            start = self.structure(near.labels), near
+            one = self.fitting.fit(self.structure(labels), initial, max(min(most, left), 1), self._tell, start)
             cut = state.phase if self.is_late else cut
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
             spent = state.failed_rollouts + self._fit_rollouts

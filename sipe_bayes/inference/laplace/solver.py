@@ -217,6 +217,10 @@ class SegmentSolver:
         """The first state: at the model as given, or at the starting point that the options name."""
         options, nominal = self.problem.options, np.clip(self.problem.space.default_theta, 0, 1)
         residual, valid = None, True
+        if (near := self.problem.near) is not None and near.starts is not None and options.initial is not None:
+            here, part = self._begin(options.initial[0]), len(self._beginnings) + 1
+            here = replace(here, stage=Stage.FIT, part=part, starts=near.starts, noise=near.noise, iteration=1)
+            return SolverState(options.initial, 0, here, wild=near.outliers)
         if options.initial is not None:
             points = options.initial
         elif self._beginnings and options.restarts > 1 and self._may_screen():
