@@ -31,6 +31,7 @@ from sipe_bayes.structure.structures import Structures
 
 FEWEST_APART = 4  # windows or spans in which nothing touches, without which nothing is asked of logs with impacts
 LEAST_SPAN = 10  # control steps of such a span
+_LINEARISED = 2.5e5  # physics steps of a linearisation of the plain model, about: a few seconds
 _SAVE_SECONDS = 1.0
 
 
@@ -198,7 +199,8 @@ def _search(
     environment = _environment(simulator)
     restriction, options = restriction or Restriction(), options or DiscoverOptions()
     _check_sites(environment, restriction.sites)
-    seconds = options.physics_steps * float(simulator.model.opt.timestep)
+    columns = 1 + len(simulator.space) + len(environment.start_sd(simulator.model))
+    seconds = min(options.physics_steps, _LINEARISED / columns) * float(simulator.model.opt.timestep)
     extensions = [get_extension(name) for name in restriction.names]
     memory = sum(extension.memory(float(trajectories.dt.max())) for extension in extensions)
     late = {c: float(own) + memory for c, own in zip(environment.channels, environment.remembers, strict=True)}
