@@ -202,8 +202,8 @@ def extensions() -> str:
         rows.append((f"`{name}`", one.kind, one.sentence("NAME"), native, one.reference))
     return f"""# Extensions
 
-Physics that [`sipe discover`](../what-a-model-lacks.md) may put into a model. `residual` is a yardstick and
-never an answer: how much of what a force without a name would explain do the named pieces explain?
+Physics that [`sipe discover`](../what-a-model-lacks.md) may add to a model. `residual` is an unstructured
+force: it is tried only where `--only` or `[structure]` names it.
 
 {table(("extension", "at", "what it is", "MJCF has it, or its nearest", "described in"), rows)}"""
 

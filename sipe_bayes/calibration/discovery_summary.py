@@ -54,7 +54,7 @@ _BEFORE = {
     Phase.FIT: "all extensions with a predicted gain were fitted",
     Phase.PRUNE: "each extension of the best structure was left out once",
 }
-"""What a search whose budget was spent did not come to, by what it was doing; the yardstick is no part of it."""
+"""What a search whose budget was spent did not come to, by what it was doing."""
 
 
 def summarise(
@@ -98,7 +98,6 @@ def summarise(
         before=plain,
         after=left,
         signals=tuple(_signals(before, after, logs, seed)),
-        named_share=structures.named_share,
         settled=structures.settled,
         best_settled=structures.best.settled,
         ended=structures.search.ended if structures.state.cut is not None else "",
@@ -270,8 +269,6 @@ def _pieces(structures: Structures) -> tuple[Piece, ...]:
     for label, weight in structures.inclusion().items():
         placed = structures.search.placed[label]
         extension, kept = placed.extension, label in structures.best.labels
-        if extension.last_resort:
-            continue
         gain, error = _gain(structures, label)
         tied = any(label in one.labels for one in structures.supported[1:])
         mjcf = extension.kind, extension.native, extension.nearest

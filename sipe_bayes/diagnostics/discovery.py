@@ -129,7 +129,6 @@ class Discovery:
         before: what the plain model leaves.
         after: what the structure that is written out leaves.
         signals: of each log and channel; ``mode`` is the structure, ``default`` the plain model, calibrated.
-        named_share: of what can be explained, what named pieces explain; None where that was not asked.
         settled: whether every fit that counts came to rest, and the budget was enough.
         rollouts: of all fits.
         column_rollouts: those of them that tried signs and units of columns.
@@ -157,7 +156,6 @@ class Discovery:
     before: Stage
     after: Stage
     signals: tuple[Signal, ...] = field(repr=False)
-    named_share: float | None
     settled: bool
     rollouts: int
     column_rollouts: int
@@ -193,7 +191,6 @@ class Discovery:
             "errors": [asdict(row) for row in self.errors],
             "comparison": None if self.comparison is None else self.comparison.to_dict(),
             **{name: _stage(stage) for name, stage in (("before", self.before), ("after", self.after))},
-            "named_share": self.named_share,
             "settled": self.settled,
             "best_settled": self.best_settled,
             "findings": [item.to_dict() for item in self.findings],

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from sipe_bayes.likelihood.binding import bind as bind
     from sipe_bayes.likelihood.binding import default_likelihood as default_likelihood
     from sipe_bayes.likelihood.block_tridiagonal import Eliminated as Eliminated
+    from sipe_bayes.likelihood.block_tridiagonal import damped_box_step as damped_box_step
     from sipe_bayes.likelihood.fit_result import FitResult as FitResult
     from sipe_bayes.likelihood.noise import Noise as Noise
     from sipe_bayes.likelihood.noise import noise_level as noise_level

@@ -114,7 +114,7 @@ def _blocks(log: IntArray, start: IntArray, stride: IntArray) -> tuple[IntArray,
 
 
 def reached(
-    remembers: FloatArray, late: FloatArray, dt: FloatArray, log: IntArray, start: IntArray, stride: IntArray
+    remembers: FloatArray, dt: FloatArray, log: IntArray, start: IntArray, stride: IntArray
 ) -> tuple[IntArray, IntArray, IntArray]:
     """How many samples (W, C) after its start a window's predictions tell of it alone, and where they begin (W, C).
 
@@ -123,7 +123,6 @@ def reached(
 
     Args:
         remembers: (C,) seconds in which a channel tells of what was before; half a block's at most.
-        late: (C,) seconds, the same of other models that are compared with this one.
         dt: (W,) seconds between samples.
         log: (W,), of which each window is.
         start: (W,), its first sample.
@@ -131,12 +130,9 @@ def reached(
     """
     first, past = _blocks(log, start, stride)
     length = past - first
-    lead, out = (
-        np.minimum(np.ceil(x / dt[:, None] - 1e-9).astype(np.int64), length[:, None] // 2)
-        for x in (remembers, np.maximum(remembers, late))
-    )
+    lead = np.minimum(np.ceil(remembers / dt[:, None] - 1e-9).astype(np.int64), length[:, None] // 2)
     into = (start - first)[:, None]
-    left_out = np.minimum(out, length[:, None] // 8) - into
+    left_out = np.minimum(lead, length[:, None] // 8) - into
     return lead, np.maximum(left_out, np.where(into, lead, 0)), past - start
 
 

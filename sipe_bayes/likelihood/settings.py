@@ -51,8 +51,8 @@ class Segments:
         starts: "estimated" with theta, or "recorded": the trajectories' states are exact (they come from a simulator)
             and each window predicts the samples after its start; ``window`` = dt then compares single control steps.
         seconds: of all logs together that count at most: blocks of windows spread over them, None for all.
-        late: (channel, seconds) of each log's first samples that do not count, as if its sensor came so late: for
-            models that are compared, some with a late sensor and some without.
+        late: (channel, seconds) by which segments are simulated and compared later, as if its sensor came so late: for
+            models that are compared on the same samples, some with a late sensor and some without.
 
     Raises:
         ValueError: for any other setting.

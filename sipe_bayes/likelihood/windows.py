@@ -139,7 +139,8 @@ class Windows:
         simulator, environment = self.simulator, self.simulator.environment
         known = self.settings.starts == "recorded"
         late = np.array([dict(self.settings.late).get(name, 0.0) for name in self.fitted])
-        *reach, left = reached(environment.remembers[self.channels], late, self.dt, self.log, self.start, self.stride)
+        late = np.maximum(late, environment.remembers[self.channels])
+        *reach, left = reached(late, self.dt, self.log, self.start, self.stride)
         self.lead, self.begin = reach if like is None else (like.lead, like.begin)
         self.steps = np.minimum(self.stride + self.lead.max(1), left)
         place = np.arange(int(self.steps.max()) + 1)
@@ -279,19 +280,6 @@ class Windows:
             missed = np.setdiff1d(self.log, self.log[kept])
             kept = np.sort(np.concatenate([kept, [np.flatnonzero(self.log == log)[0] for log in missed]]).astype(int))
         return kept
-
-    def compared_late(self) -> Windows:
-        """The same, simulated on and compared as those of the latest model of ``settings.late``.
-
-        Where a model has a late sensor, segments are compared from later samples on. So their initial states are less
-        well known and cost less evidence. All models are compared on the same samples for that reason.
-        """
-        late = np.array([dict(self.settings.late).get(name, 0.0) for name in self.fitted])
-        if not late.any():
-            return self
-        latest, like = np.maximum(late, self.simulator.environment.remembers[self.channels]), copy.copy(self)
-        like.lead, like.begin, _ = reached(latest, latest, self.dt, self.log, self.start, self.stride)
-        return Windows(self.settings, self.simulator, self.trajectories, like)
 
     def part(self, keep: IntArray, observed: BoolArray | None = None) -> Windows:
         """Some of the windows, and samples (K, L, C) of theirs."""
@@ -464,12 +452,8 @@ class Windows:
         """Rollouts of each log that ``fit_starts`` takes at most."""
         return 1 + _ITERATIONS * (self.num_start + len(_SHORTER))
 
-    def fit_starts(
-        self, theta: FloatArray, noise: Noise, starts: FloatArray | None = None, most: int = _ITERATIONS
-    ) -> tuple[FloatArray, FloatArray, bool]:
+    def fit_starts(self, theta: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray, bool]:
         """Starts (W, D) that minimise the whitened residuals at a fixed theta (N,), each window by itself.
-
-        starts: near which they are searched; default the measured ones. most: steps.
 
         Returns:
             Them, the residuals (W, L, C) from them, and whether that simulation is valid.
@@ -484,10 +468,10 @@ class Windows:
             squares = [np.bincount(s.window, r[0] ** 2, minlength=len(starts)) for r, s in rows]
             return np.asarray(sum(squares)) + starts**2 @ self.start_precision
 
-        starts = self.no_starts() if starts is None else starts
+        starts = self.no_starts()
         residual, valid = simulated(starts)
         energy = energies(starts, residual)
-        for _ in range(most if valid and np.isfinite(residual).all() else 0):
+        for _ in range(_ITERATIONS if valid and np.isfinite(residual).all() else 0):
             linearisation = self.linearise(theta, starts, with_theta=False, residual=residual)
             move = self.log_density(self.moments(linearisation), noise, starts)[1]
             before, rest = energy.sum(), np.ones(len(starts), bool)
@@ -498,7 +482,7 @@ class Windows:
                 better = rest & (after < energy)
                 starts = np.where(better[:, None], tried, starts)
                 residual, energy = np.where(better[:, None, None], left, residual), np.where(better, after, energy)
-                rest &= ~better & (before > 0)
+                rest &= ~better
                 if not rest.any():
                     break
             if not energy.sum() < (1 - _SETTLED) * before:

@@ -31,8 +31,6 @@ from sipe_bayes.structure.structures import Structures
 
 FEWEST_APART = 4  # windows or spans in which nothing touches, without which nothing is asked of logs with impacts
 LEAST_SPAN = 10  # control steps of such a span
-_LINEARISED = 2.5e5  # physics steps of a linearisation of the plain model, about: a few seconds
-_SAVE_SECONDS = 1.0
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,8 @@ class Restriction:
     @property
     def names(self) -> list[str]:
         """Those that may be tried."""
-        chosen = [*(EXTENSIONS if self.only is None else self.only), *self.extra]
+        usual = [name for name in EXTENSIONS if not get_extension(name).by_name]
+        chosen = [*(usual if self.only is None else self.only), *self.extra]
         return [name for name in dict.fromkeys(chosen) if name not in (*self.without, PhysicsStep.name)]
 
     @property
@@ -126,11 +125,11 @@ def discover(
     if checkpoint is not None and checkpoint.exists():
         enough = search.enough([]) / search.options.plain_share
         state = load_state(checkpoint, DiscoverState, fingerprint).with_budget(search.budget, enough)
-    saved = -_SAVE_SECONDS
+    saved = -math.inf
     try:
         while not state.done:
             before, state = state, search.step(state)
-            if checkpoint is not None and (state.done or time.monotonic() - saved > _SAVE_SECONDS):
+            if checkpoint is not None and (state.done or time.monotonic() - saved > 1.0):
                 save_state(checkpoint, before if state.cut else state, fingerprint)  # larger budgets take it anew
                 saved = time.monotonic()
         search.place(state)
@@ -200,7 +199,8 @@ def _search(
     restriction, options = restriction or Restriction(), options or DiscoverOptions()
     _check_sites(environment, restriction.sites)
     columns = 1 + len(simulator.space) + len(environment.start_sd(simulator.model))
-    seconds = min(options.physics_steps, _LINEARISED / columns) * float(simulator.model.opt.timestep)
+    # a linearisation of the plain model takes a few seconds at most
+    seconds = min(options.physics_steps, 2.5e5 / columns) * float(simulator.model.opt.timestep)
     extensions = [get_extension(name) for name in restriction.names]
     memory = sum(extension.memory(float(trajectories.dt.max())) for extension in extensions)
     late = {c: float(own) + memory for c, own in zip(environment.channels, environment.remembers, strict=True)}

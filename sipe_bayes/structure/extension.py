@@ -56,7 +56,7 @@ class Extension(ABC):
     reference: str
     native: bool = True  # MJCF has an element for it
     nearest: str = ""  # the element of MJCF that comes nearest, where it has none of its own
-    last_resort: bool = False  # tried only where nothing else helps
+    by_name: bool = False  # tried only where it is named
 
     @abstractmethod
     def sentence(self, site: str) -> str:

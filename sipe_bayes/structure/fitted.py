@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -22,7 +22,6 @@ from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.columns import Column, corrected
 from sipe_bayes.structure.extension import Placed, extended
-from sipe_bayes.structure.internal_starts import mapped_starts
 from sipe_bayes.structure.scores import Pieces, predictive, scores
 
 # structures differ by nats, and where friction has kinks the last ones come in ever smaller steps
@@ -47,7 +46,6 @@ class FittedStructure:
         held: pieces that were held out.
         rollouts: that the fit took.
         settled: whether the search had come to rest.
-        outliers: (k, 3), samples that the fit left out, by log, number in it and channel.
     """
 
     labels: tuple[str, ...]
@@ -61,7 +59,6 @@ class FittedStructure:
     held: Pieces
     rollouts: int
     settled: bool
-    outliers: IntArray = field(default_factory=lambda: np.zeros((0, 3), np.int64))
 
     @property
     def spanned(self) -> FloatArray:
@@ -133,12 +130,7 @@ class Fitting:
         return beside(self.prior, simulator.space)
 
     def fit(
-        self,
-        placed: Sequence[Placed],
-        initial: FloatArray | None,
-        budget: int,
-        progress: Progress | None = None,
-        near: tuple[Sequence[Placed], FittedStructure] | None = None,
+        self, placed: Sequence[Placed], initial: FloatArray | None, budget: int, progress: Progress | None = None
     ) -> FittedStructure:
         """The best optimum of a structure, and its scores.
 
@@ -147,7 +139,6 @@ class Fitting:
             initial: (N + P,), where the search begins; default as ``laplace`` does.
             budget: rollouts at most.
             progress: called along the way.
-            near: extensions of a structure with a few more or less, and its fit, from which this one begins.
 
         Raises:
             BudgetTooSmall: where it ends before there is an optimum.
@@ -156,9 +147,8 @@ class Fitting:
         prior = self.prior_of(simulator)
         windows = self.windows(simulator)
         left = max(budget - self._scoring(windows), 1)
-        best, rollouts = self._optimum(simulator, prior, initial, left, progress, self._near(simulator, near))
+        best, rollouts = self._optimum(simulator, prior, initial, left, progress)
         assert best.starts is not None
-        windows.mask(best.outliers)
         both = scores(windows, best.theta, best.starts, best.noise, QuadraticPrior.of(prior))
         pieces = both.pieces
         if self.holdout is not None:
@@ -180,22 +170,13 @@ class Fitting:
             pieces,
             rollouts + windows.rollouts,
             best.finding is None,
-            best.outliers,
         )
-
-    def _near(self, simulator: Simulator, near: tuple[Sequence[Placed], FittedStructure] | None) -> FitResult | None:
-        """The fit of a similar structure, as one of a simulator's model."""
-        if near is None:
-            return None
-        placed, one = near
-        starts = mapped_starts(self.simulator(placed).model, simulator.model, one.starts)
-        at = one.theta, one.mean, one.covariance, one.noise, one.evidence
-        return FitResult(*at, starts, None, None, one.outliers, None)
 
     def _scoring(self, windows: BoundLikelihood) -> int:
         """Rollouts that the scores of an optimum take."""
         held = 0 if self.holdout is None else len(self.holdout)
-        return (windows.num_theta + windows.num_start + 1 + windows.starts_cost) * (len(self.trajectories) + held)
+        each = windows.num_theta + windows.num_start + 2
+        return each * len(self.trajectories) + (each + windows.starts_cost) * held
 
     def _optimum(
         self,
@@ -204,7 +185,6 @@ class Fitting:
         initial: FloatArray | None,
         budget: int,
         progress: Progress | None,
-        near: FitResult | None,
     ) -> tuple[FitResult, int]:
         """The best optimum, and the rollouts that the fit took."""
         given = None if initial is None else initial[None]
@@ -218,7 +198,6 @@ class Fitting:
             initial=given,
             tuning=EVIDENCE_TUNING,
         )
-        laplace.near = near
         laplace.time_limit = max(self.ends - time.monotonic(), 0.0)
         laplace.fit(self.trajectories)
         assert laplace.result is not None

@@ -13,14 +13,9 @@ from sipe_bayes.likelihood import BoundLikelihood
 
 
 def mapped_starts(before: mujoco.MjModel, after: mujoco.MjModel, starts: FloatArray) -> FloatArray:
-    """Starts (..., W, D) of one model as starts of an extended one: what it has more begins at its reference.
-
-    Or of an extended model as starts of what it extends, which forget what that has not.
-    """
+    """Starts (..., W, D) of one model as starts of an extended one: what it has more begins at its reference."""
     if not starts.shape[-1]:
         return starts
-    if after.nv + after.na < before.nv + before.na:
-        return starts[..., _places(after, before)]
     out = np.zeros((*starts.shape[:-1], 2 * after.nv + after.na))
     out[..., _places(before, after)] = starts
     return out

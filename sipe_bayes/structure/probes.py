@@ -162,16 +162,16 @@ def _step_error(
 def place_extensions(
     windows: BoundLikelihood, theta: FloatArray, starts: FloatArray, extensions: Sequence[Extension] | None = None
 ) -> list[Placed]:
-    """Extensions, by default all that the registry has, but those of last resort, wherever they have a place.
+    """Extensions, by default all that the registry has, but those tried by name alone, where they have a place.
 
     Nowhere in an environment that is no user's MJCF.
     """
     if not isinstance(windows.simulator.environment, MjcfEnvironment):
         return []
     machine = machine_of(windows, theta, starts)
-    chosen = (get_extension(name) for name in EXTENSIONS) if extensions is None else extensions
-    every = (p for extension in chosen for p in placements(extension, machine))
-    return [p for p in every if not p.extension.last_resort]
+    usual = (get_extension(name) for name in EXTENSIONS)
+    chosen = [extension for extension in usual if not extension.by_name] if extensions is None else extensions
+    return [p for extension in chosen for p in placements(extension, machine)]
 
 
 def _unit(change: FloatArray) -> FloatArray:

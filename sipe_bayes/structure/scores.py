@@ -20,6 +20,7 @@ Deviations:
 
 - The noise is that of the fit to all training logs. Pieces are compared as if noise began anew in each.
 - Directions that the data leave open get the flat normal of ``likelihood.quadratic_prior``.
+- g is zero but at a bound: where simulations are rough, slopes promise gains that the search did not find.
 """
 
 from __future__ import annotations
@@ -31,13 +32,10 @@ import numpy as np
 from scipy.special import ndtr
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
-from sipe_bayes.likelihood import FLAT_PRECISION, BoundLikelihood, Noise, QuadraticPrior
-from sipe_bayes.likelihood.block_tridiagonal import damped_box_step
+from sipe_bayes.likelihood import FLAT_PRECISION, BoundLikelihood, Noise, QuadraticPrior, damped_box_step
 from sipe_bayes.posterior.truncated_normal import TruncatedNormal
 
 _PIECES = 40  # of all logs together, at most
-_STEPS = 8  # in which initial states are fitted to other samples than those of the fit; most take two
-_CUT_OFF = 1e-3  # of a parameter's normal by the cube, which may be left out
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ class Scores:
 def scores(
     windows: BoundLikelihood, theta: FloatArray, starts: FloatArray, noise: Noise, prior: QuadraticPrior
 ) -> Scores:
-    """Both scores of an optimum; costs a linearisation, and a search for initial states where sensors may be late.
+    """Both scores of an optimum; costs a linearisation.
 
     Args:
         windows: the logs, W windows.
@@ -85,37 +83,31 @@ def scores(
     Raises:
         ValueError: where the simulation diverges.
     """
-    own, windows = windows, windows.compared_late()
-    if windows is not own and windows.num_start:  # which are compared on other samples than those of the fit
-        starts = windows.fit_starts(theta, noise, starts, _STEPS)[0]
     linearisation = windows.linearise(theta, starts)
-    own.rollouts += windows.rollouts if windows is not own else 0
     if not linearisation.valid:
         raise ValueError("theta: the simulation diverges at the optimum")
     # one block for each window also where starts are known
-    moments = windows.moments(linearisation)
-    products, constants = moments.normal(noise), _log_determinants(windows, noise)
-    linear, products = _Linear(windows, theta, starts, prior).centred(products)
-    evidence = linear.evidence(products, float(constants.sum()))
+    products, constants = windows.moments(linearisation).normal(noise), _log_determinants(windows, noise)
+    linear = _Linear(windows, theta, starts, prior)
+    linear = replace(linear, untaken=linear.step(products))
+    evidence = linear.evidence(linear.centred(products), float(constants.sum()))
     parts = _parts(windows)
     if len(parts) < 2 or len(products) < len(windows.log):
-        every = [np.ones(windows.num_windows, bool)]
-        return Scores(evidence, _pieces(windows, every, np.array([evidence]), constants))
+        one = [np.ones(windows.num_windows, bool)]
+        return Scores(evidence, _pieces(windows, one, np.array([evidence]), constants))
     windows = windows.cut(np.array([part.argmax() for part in parts]))
     products, constants = windows.moments(linearisation).normal(noise), _log_determinants(windows, noise)
-    linear, products = _Linear(windows, theta, starts, prior).centred(products)
-    whole = linear.evidence(products, float(constants.sum()))
+    linear, products = replace(linear, windows=windows), linear.centred(products)
+    every = linear.evidence(products, float(constants.sum()))
     without = [linear.evidence_of(products, constants, ~part) for part in parts]
-    return Scores(evidence, _pieces(windows, parts, whole - np.array(without), constants))
+    return Scores(evidence, _pieces(windows, parts, every - np.array(without), constants))
 
 
 def predictive(windows: BoundLikelihood, theta: FloatArray, noise: Noise, posterior: QuadraticPrior) -> Pieces:
-    """Pieces of held-out logs, minus infinity where a simulation diverges.
+    """Pieces of held-out logs; minus infinity where a simulation diverges; costs two linearisations and more.
 
-    Costs a linearisation and a search for initial states.
-
-    The starts are those that fit best; the noise is that of the held-out logs themselves, since a
-    model's error differs from motion to motion.
+    The starts are those that fit best; the noise is that of the held-out logs themselves, since a model's error differs
+    from motion to motion.
 
     Args:
         windows: the held-out logs.
@@ -123,11 +115,9 @@ def predictive(windows: BoundLikelihood, theta: FloatArray, noise: Noise, poster
         noise: (C,), there, at which the estimate of the held-out logs' begins.
         posterior: of theta, given the training logs.
     """
-    own, windows = windows, windows.compared_late()
     parts = _parts(windows) if windows.num_start else [np.ones(windows.num_windows, bool)]  # known starts: one block
-    starts = windows.fit_starts(theta, noise, most=_STEPS)[0] if windows.num_start else windows.no_starts()
+    starts = windows.fit_starts(theta, noise)[0] if windows.num_start else windows.no_starts()
     linearisation = windows.linearise(theta, starts)
-    own.rollouts += windows.rollouts if windows is not own else 0
     if not linearisation.valid:
         lost = np.full(len(parts), -np.inf)
         return Pieces(lost, np.array([windows.log[part][0] for part in parts]), np.ones(len(parts)))
@@ -146,33 +136,35 @@ def predictive(windows: BoundLikelihood, theta: FloatArray, noise: Noise, poster
 class _Linear:
     """The linear model around theta (N,) and starts (W, D).
 
-    untaken: the step (N,) that the linear model asks for and the search did not take; None where it may be taken.
+    untaken: steps (N,) and (W, D) that it asks for and the search did not take.
     """
 
     windows: BoundLikelihood
     theta: FloatArray
     starts: FloatArray
     prior: QuadraticPrior
-    untaken: FloatArray | None = None
+    untaken: tuple[FloatArray, FloatArray] | None = None
 
-    def centred(self, products: FloatArray) -> tuple[_Linear, FloatArray]:
-        """The model, and whitened products (W, K, K), whose optimum within the cube is where it stands.
-
-        The search ended there, so where simulations are rough a gain that slopes still promise is none.
-        """
-        n, solved = len(self.theta), self.windows.eliminate(products, len(self.theta), self.starts)
-        if not n:
-            return self, products
-        precision = solved.precision + self._inner
-        move = damped_box_step(precision, solved.gradient + self._pull, self.theta, 0.0)
-        own, d = solved.blocks(move), self.windows.num_start
+    def centred(self, products: FloatArray) -> FloatArray:
+        """Whitened products (W, K, K) by which the optimum within the cube is where the search ended."""
+        if self.untaken is None:
+            return products
+        n, d, (move, own) = len(self.theta), self.windows.num_start, self.untaken
         step = np.concatenate([np.tile(move, (len(products), 1)), own, np.roll(own, 1, axis=0)], axis=1)
         change = np.einsum("wij,wj->wi", products[:, :-1, :-1], step)
         change[:, n : n + d] += own * self.windows.start_precision
         products = products.copy()
         products[:, :-1, -1] -= change
         products[:, -1, :-1] -= change
-        return replace(self, untaken=move), products
+        return products
+
+    def step(self, products: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Of theta (N,), within the cube, and of the starts (W, D), that whitened products (W, K, K) ask for."""
+        solved = self.windows.eliminate(products, len(self.theta), self.starts)
+        move = np.zeros(len(self.theta))
+        if len(move):
+            move = damped_box_step(solved.precision + self._inner, solved.gradient + self._pull, self.theta, 0.0)
+        return move, solved.blocks(move)
 
     @property
     def _inner(self) -> FloatArray:
@@ -183,7 +175,7 @@ class _Linear:
     def _pull(self) -> FloatArray:
         """Of the prior (N,)."""
         pull = self.prior.pull(self.theta) + FLAT_PRECISION * (0.5 - self.theta)
-        return pull if self.untaken is None else pull - self._inner @ self.untaken
+        return pull if self.untaken is None else pull - self._inner @ self.untaken[0]
 
     def evidence_of(self, products: FloatArray, constants: FloatArray, which: BoolArray) -> float:
         """Log p of the rows of some windows (W,) alone."""
@@ -223,7 +215,7 @@ class _RoughMass(TruncatedNormal):
 def _log_mass(mean: FloatArray, covariance: FloatArray) -> float:
     """Log of a normal's mass in the cube, by the parameters (N,) of which that cuts off more than a thousandth."""
     sd = np.sqrt(np.diag(covariance))
-    cut = np.flatnonzero(ndtr(-mean / sd) + ndtr((mean - 1) / sd) > _CUT_OFF)
+    cut = np.flatnonzero(ndtr(-mean / sd) + ndtr((mean - 1) / sd) > 1e-3)
     return _RoughMass(mean[cut], covariance[np.ix_(cut, cut)]).log_mass
 
 

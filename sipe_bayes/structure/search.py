@@ -11,9 +11,8 @@ r"""The search over structures: what fits best is extended, round by round; then
       v                                           v
     FIT     the best few, one a step           PRUNE   each extension of the best structure left out once
       |  some are clearly better                  v
-      +--> RANK, with these as the beam        RESIDUAL  an unstructured force, as the yardstick
-         none is: PRUNE                           v
-                                                DONE
+      +--> RANK, with these as the beam         DONE
+         none is: PRUNE
 
 **Judgement** is ``comparison``'s alone: a structure is extended where it predicts pieces that it has not seen clearly
 better than all that it contains, and is not clearly behind the best one. For a single extension one standard error is
@@ -94,7 +93,6 @@ class StructureSearch:
             Phase.RANK: self._rank,
             Phase.FIT: self._fit,
             Phase.PRUNE: self._prune,
-            Phase.RESIDUAL: self._residual,
             Phase.DONE: lambda state: state,
         }[state.phase](state)
         if state.cut is None:
@@ -120,12 +118,6 @@ class StructureSearch:
         """The extensions wherever the machine has a place for them, after the first step."""
         return self._placed
 
-    def counts(self, state: DiscoverState, one: FittedStructure) -> bool:
-        """Whether a structure has named extensions alone, and the budget did not end in its fit."""
-        return one.labels != state.cut_off and not any(
-            self._placed[label].extension.last_resort for label in one.labels
-        )
-
     def supported(self, state: DiscoverState) -> list[FittedStructure]:
         """The set that the logs support: ties, the simplest one first, of native elements where these do as well."""
 
@@ -133,7 +125,7 @@ class StructureSearch:
             native = all(self._placed[label].extension.native for label in one.labels)
             return len(one.labels), not native, -rank(one)[1]
 
-        counted = [one for one in state.fitted if self.counts(state, one)]
+        counted = [one for one in state.fitted if one.labels != state.cut_off]
         return sorted(choose_ties(counted, self._contains), key=simple)
 
     def _contains(self, one: FittedStructure, other: FittedStructure) -> bool:
@@ -229,7 +221,7 @@ class StructureSearch:
             if labels not in state.ranked and len(self._ladder.pieces(labels)) < self.options.most:
                 here = state.of(labels)
                 assert here is not None
-                return self._ranked(state, here, last_resort=False)[0]
+                return self._ranked(state, here)
         queue = self._queue(state)
         return replace(state, queue=queue, phase=Phase.FIT if queue else Phase.PRUNE)
 
@@ -262,19 +254,17 @@ class StructureSearch:
         stepped = offer.label in self._ladder.labels
         return (*(self._ladder.pieces(offer.at) if stepped else offer.at), offer.label)
 
-    def _ranked(
-        self, state: DiscoverState, here: FittedStructure, last_resort: bool
-    ) -> tuple[DiscoverState, list[Candidate]]:
-        """Predicted gains beside a structure, best first, and the state with them; cut where the budget ends."""
+    def _ranked(self, state: DiscoverState, here: FittedStructure) -> DiscoverState:
+        """The state with predicted gains beside a structure, best first; cut where the budget ends."""
         fitting, own = self.fitting, self.structure(here.labels)
         simulator = fitting.simulator(own)
         windows, prior = fitting.windows(simulator), QuadraticPrior.of(fitting.prior_of(simulator))
         taken = {*here.labels, *(t for p in own for q in p.parameters for t in q.targets)}
-        rest = [p for p in self._placed.values() if p.extension.last_resort == last_resort and p.parameters]
+        rest = [p for p in self._placed.values() if p.parameters]
         rest = [p for p in rest if not taken & {p.label, *(t for q in p.parameters for t in q.targets)}]
         windows.budget, ranked, cut, gain = self._left(state), list[Candidate](), None, 0.0
         windows.deadline = Deadline(fitting.ends)
-        finer = None if last_resort else self._ladder.finer(here.labels)
+        finer = self._ladder.finer(here.labels)
         try:
             if rest or finer is not None:
                 at, tell = (here.theta, here.noise, here.starts, prior), partial(self._simulating, windows)
@@ -289,8 +279,8 @@ class StructureSearch:
         ranks = state.rank_rollouts + windows.rollouts
         if finer is not None and gain > 0:
             offers = (*offers, Offer(here.labels, finer[-1], gain, np.zeros(0), here.theta))
-        done = (*state.ranked, here.labels) if cut is None and not last_resort else state.ranked
-        return replace(state, offers=state.offers + offers, ranked=done, rank_rollouts=ranks, cut=cut), ranked
+        done = (*state.ranked, here.labels) if cut is None else state.ranked
+        return replace(state, offers=state.offers + offers, ranked=done, rank_rollouts=ranks, cut=cut)
 
     def _simulating(self, windows: BoundLikelihood, what: str) -> None:
         self._tell(what, windows.rollouts)
@@ -302,9 +292,7 @@ class StructureSearch:
     def _fit(self, state: DiscoverState) -> DiscoverState:
         labels, *rest = state.queue
         offer = next(o for o in reversed(state.offers) if self._grown(o) == labels)
-        near = state.of(offer.at)
-        assert near is not None
-        state = self._fitted(state, labels, np.concatenate([offer.others, offer.theta]), near)
+        state = self._fitted(state, labels, np.concatenate([offer.others, offer.theta]))
         if state.cut is not None:
             return state
         state = replace(state, queue=tuple(rest))
@@ -330,20 +318,10 @@ class StructureSearch:
             if labels not in state.pruned and labels not in state.failed:
                 keep = [i for i, label in enumerate(self._owners(best)) if label in (None, *labels)]
                 before, failed = state.of(labels), state.failed
-                state = self._fitted(state, labels, best.theta[keep], best)
+                state = self._fitted(state, labels, best.theta[keep])
                 if before is not None:  # a failure says nothing then
                     state = replace(state, fitted=_merged(state.fitted, before), failed=failed)
                 return replace(state, pruned=(*state.pruned, labels))
-        return replace(state, phase=Phase.RESIDUAL)
-
-    def _residual(self, state: DiscoverState) -> DiscoverState:
-        here = self.supported(state)[0]
-        state, ranked = self._ranked(state, here, last_resort=True)
-        if state.cut is not None:
-            return state
-        if ranked and ranked[0].gain > self.options.least_gain:
-            labels = (*here.labels, ranked[0].placed.label)
-            state = self._fitted(state, labels, np.concatenate([here.theta, ranked[0].theta]), here)
         return replace(state, phase=Phase.DONE)
 
     def _owners(self, one: FittedStructure) -> list[str | None]:
@@ -352,17 +330,13 @@ class StructureSearch:
         own: list[str | None] = [None] * count
         return own + [label for label in one.labels for _ in self._placed[label].parameters]
 
-    def _fitted(
-        self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray, near: FittedStructure
-    ) -> DiscoverState:
-        """A structure fitted from the initial states of a similar one."""
+    def _fitted(self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray) -> DiscoverState:
         left, cut = self._left(state), None
         self._rollouts, self._fit_rollouts = state.rollouts, 0
         try:
             most = self.enough(labels)
             cut = state.phase if left < most else None
-            start = self.structure(near.labels), near
-            one = self.fitting.fit(self.structure(labels), initial, max(min(most, left), 1), self._tell, start)
+            one = self.fitting.fit(self.structure(labels), initial, max(min(most, left), 1), self._tell)
             cut = state.phase if self.is_late else cut
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
             spent = state.failed_rollouts + self._fit_rollouts

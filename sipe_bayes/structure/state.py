@@ -40,7 +40,6 @@ class Phase(enum.Enum):
     RANK = "rank"
     FIT = "fit"
     PRUNE = "prune"
-    RESIDUAL = "residual"
     DONE = "done"
 
 
@@ -124,7 +123,6 @@ class DiscoverState:
             Phase.RANK: f"testing {extensions} extensions{beside}",
             Phase.FIT: f"fitting {' and '.join(self.queue[0]) if self.queue else ''}",
             Phase.PRUNE: "leaving out each extension once",
-            Phase.RESIDUAL: "fitting an unstructured residual force",
             Phase.DONE: "done",
         }[self.phase]
 

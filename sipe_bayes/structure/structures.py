@@ -17,7 +17,7 @@ from sipe_bayes.structure.comparison import difference, stack
 from sipe_bayes.structure.extension import Placed
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.search import StructureSearch
-from sipe_bayes.structure.state import DiscoverState, Offer, Phase
+from sipe_bayes.structure.state import DiscoverState, Offer
 
 _NEGLIGIBLE = 1e-3  # weight below which a structure is left out of the average
 
@@ -37,7 +37,6 @@ class StructureRow:
         tied: whether it is of that set: structures that the logs do not tell apart.
         weight: in the stacked predictions; zero outside the set that the logs support.
         rollouts: that its fit took.
-        yardstick: whether it has a force without a name, and is no candidate itself.
     """
 
     sentences: tuple[str, ...]
@@ -50,7 +49,6 @@ class StructureRow:
     tied: bool
     weight: float
     rollouts: int
-    yardstick: bool
 
 
 @dataclass(frozen=True)
@@ -82,9 +80,8 @@ class Structures:
 
     @property
     def settled(self) -> bool:
-        """Whether every fit that matters came to rest and the budget was enough, but for the yardstick."""
-        enough = self.state.done and self.state.cut in (None, Phase.RESIDUAL)
-        return enough and all(one.settled for one in self.supported)
+        """Whether every fit that matters came to rest and the budget was enough."""
+        return self.state.done and self.state.cut is None and all(one.settled for one in self.supported)
 
     @property
     def so_far(self) -> str:
@@ -113,9 +110,6 @@ class Structures:
         """Stacking weights (S,) of the fitted structures; zero outside the set that the logs support."""
         stacked = dict(zip(map(id, self.supported), stack(self.supported).tolist(), strict=True))
         return np.array([stacked.get(id(one), 0.0) for one in self.fitted])
-
-    def _is_yardstick(self, one: FittedStructure) -> bool:
-        return any(self.search.placed[label].extension.last_resort for label in one.labels)
 
     @property
     def best(self) -> FittedStructure:
@@ -154,20 +148,8 @@ class Structures:
         for weight, one in zip(self.weights.tolist(), self.fitted, strict=True):
             sentences, evidence = tuple(x.sentence for x in self.placed(one)), one.evidence - self.plain.evidence
             scores = (evidence, *difference(one, self.plain), *difference(self.best, one), one.labels in order, weight)
-            rows.append(StructureRow(sentences, one.labels, *scores, one.rollouts, self._is_yardstick(one)))
+            rows.append(StructureRow(sentences, one.labels, *scores, one.rollouts))
         return sorted(rows, key=lambda row: (order.get(row.labels, len(order)), -row.gain))
-
-    @property
-    def named_share(self) -> float | None:
-        """Of the evidence that a force without a name could explain beside the best structure, what named pieces do.
-
-        None where no such force was fitted.
-        """
-        for one in self.fitted:
-            if self._is_yardstick(one):
-                whole = max(one.evidence, self.best.evidence) - self.plain.evidence
-                return (self.best.evidence - self.plain.evidence) / whole if whole > 0 else None
-        return None
 
     @property
     def posterior(self) -> GaussianMixture:

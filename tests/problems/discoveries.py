@@ -45,10 +45,10 @@ def piece(name: str, site: str = "hinge", kept: bool = False, **changes: object)
     return Piece(**told | changes)  # type: ignore[arg-type]
 
 
-def row(*labels: str, weight: float = 0.0, behind: float = 0.0, yardstick: bool = False) -> StructureRow:
+def row(*labels: str, weight: float = 0.0, behind: float = 0.0) -> StructureRow:
     """A structure, the plain one without labels; of the set that the logs support where it has a weight."""
     gain = 20.0 * len(labels)
-    return StructureRow(labels, labels, gain / 2, gain, 6.3, behind, 9.0, weight > 0, weight, 100, yardstick)
+    return StructureRow(labels, labels, gain / 2, gain, 6.3, behind, 9.0, weight > 0, weight, 100)
 
 
 def make_discovery(*pieces: Piece, rows: int = 2, tied: tuple[StructureRow, ...] = ()) -> Discovery:
@@ -77,7 +77,6 @@ def make_discovery(*pieces: Piece, rows: int = 2, tied: tuple[StructureRow, ...]
         before=Stage(noise, LARGE, (residual,)),
         after=Stage(noise, NOISE, (residual,)),
         signals=tuple(signal(log, log, "angle") for log in ("holdout", "train")),
-        named_share=0.8,
         settled=True,
         rollouts=1234,
         column_rollouts=0,

@@ -89,7 +89,6 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
         "Adding cogging gains +9.0 ± 9.0 nats: less than two standard errors, so it is left out.",
     ),
     "noise": (make_discovery(FRICTION), "good", "What remains passes for noise (p = 0.4)."),
-    "share": (make_discovery(FRICTION), "good", "Pieces with a name explain 80 %"),
     "small": (changed(FRICTION, **left(SMALL)), "fair", "something small, like drag at hinge"),
     "large": (changed(FRICTION, **left(LARGE)), "bad", "it looks most like drag at hinge"),
     "unknown": (changed(FRICTION, **left(None)), "fair", "cannot be told"),
@@ -159,14 +158,6 @@ def test_twenty_lines_hold_whatever_there_is_to_say(capsys: pytest.CaptureFixtur
     assert len(lines) <= 20
     assert [line for line in lines if "more, in the report" in line]
     assert lines[-1].startswith("next: ")
-
-
-def test_a_yardstick_has_no_weight(capsys: pytest.CaptureFixture[str]) -> None:
-    discovery = changed(FRICTION, rows=(row("friction", weight=1.0), row("residual", yardstick=True)))
-    print_discovery(discovery)
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  residual")]
-    assert line.split()[-1] == "–"
-    assert "–" in render_discovery(discovery, [])
 
 
 def test_page_says_it_all_and_escapes_names() -> None:

@@ -107,7 +107,7 @@ def search_of(*fitted: FittedStructure) -> tuple[StructureSearch, list[FittedStr
         ends=np.inf, holdout=None, corrected=lambda columns: fitting, simulator=lambda pieces: None
     )
     search, asked = StructureSearch(fitting, ()), list[FittedStructure]()
-    named = SimpleNamespace(extension=SimpleNamespace(last_resort=False, native=True), parameters=(None,))
+    named = SimpleNamespace(extension=SimpleNamespace(native=True), parameters=(None,))
     search._placed = dict.fromkeys("abcd", named)  # type: ignore[arg-type]
 
     def fit(state: DiscoverState, labels: tuple[str, ...], initial: np.ndarray) -> DiscoverState:

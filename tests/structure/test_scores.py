@@ -13,12 +13,12 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace import Laplace
-from sipe_bayes.likelihood import Noise, QuadraticPrior, Segments
+from sipe_bayes.likelihood import FLAT_PRECISION, Noise, QuadraticPrior, Segments
 from sipe_bayes.likelihood.restricted import marginal
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.scores import scores
+from sipe_bayes.structure.scores import Scores, scores
 from tests.problems.pendulums import log, pendulum
 
 XML = """<mujoco><option timestep="0.02" gravity="0 0 0"/><worldbody>
@@ -82,12 +82,21 @@ def exact(windows: Windows, rho: float, keep: BoolArray | None = None) -> float:
 
 
 def ours(windows: Windows, rho: float) -> tuple[float, float]:
-    """Both scores, linearised somewhere else than at the optimum: the model is linear."""
-    noise = Noise(np.array([SD]), np.array([-DT / np.log(rho) if rho else 0.0]))
-    prior = QuadraticPrior.of(default_prior(windows.simulator.space))
-    theta = np.full(windows.num_theta, 0.4)
-    both = scores(windows, theta, windows.no_starts(), noise, prior)
+    """Both scores at the optimum."""
+    both = at_optimum(windows, rho)
     return both.evidence, float(both.pieces.density.sum())
+
+
+def at_optimum(windows: Windows, rho: float) -> Scores:
+    """Scores where one step of the linear model leads."""
+    noise = Noise(np.array([SD]), np.array([-DT / np.log(rho) if rho else 0.0]))
+    prior, n = QuadraticPrior.of(default_prior(windows.simulator.space)), windows.num_theta
+    theta, starts = np.full(n, 0.4), windows.no_starts()
+    normal = windows.moments(windows.linearise(theta, starts)).normal(noise)
+    solved, inner = windows.eliminate(normal, n), prior.precision + FLAT_PRECISION * np.eye(n)
+    pull = solved.gradient + prior.pull(theta) + FLAT_PRECISION * (0.5 - theta)
+    move = np.linalg.solve(solved.precision + inner, pull)
+    return scores(windows, theta + move, starts + solved.blocks(move), noise, prior)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.7])
@@ -117,9 +126,7 @@ def test_held_out_pieces_are_foretold_as_by_refitting(logs: int) -> None:
 def test_what_pieces_are_given_does_not_depend_on_how_noise_follows_itself(rho: float) -> None:
     """Of white noise, told to be coloured: a piece never knows the sample behind its end."""
     windows = bound([OFFSET], 0.0)
-    noise = Noise(np.array([SD]), np.array([-DT / np.log(rho) if rho else 0.0]))
-    prior = QuadraticPrior.of(default_prior(windows.simulator.space))
-    both = scores(windows, np.full(1, 0.4), windows.no_starts(), noise, prior)
+    both = at_optimum(windows, rho)
     print(both.pieces.density.sum() - both.evidence)
     assert both.pieces.density.sum() - both.evidence == pytest.approx(-0.1, abs=0.3)  # 2 nats and more if it knew it
 

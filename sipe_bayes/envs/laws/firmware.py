@@ -16,7 +16,6 @@ import mujoco
 from sipe_bayes.envs.laws.base import SINGLE, LawError
 
 _NAME = "firmware:"
-_ACTUATOR = int(mujoco.mjtObj.mjOBJ_ACTUATOR)
 _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _SET_POINT = (int(mujoco.mjtCtrlInput.mjINPUT_POS), int(mujoco.mjtCtrlInput.mjINPUT_VEL))
 _FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))

@@ -83,7 +83,6 @@ class Laplace(Estimator[LaplaceState]):
     options_type = LaplaceOptions
     state_type = LaplaceState
     options: LaplaceOptions
-    near: FitResult | None = None  # of a similar model, from whose initial states segments are fitted
 
     def check_options(self) -> None:
         """Hold the starting points against the parameters, and into the cube."""
@@ -115,7 +114,7 @@ class Laplace(Estimator[LaplaceState]):
     @property
     def problem(self) -> SearchProblem:
         """What its search is given."""
-        return SearchProblem(self.space, self.prior, self.seed, self.options, self.findings.add, self.near, self.tell)
+        return SearchProblem(self.space, self.prior, self.seed, self.options, self.findings.add, self.tell)
 
     def start(self, trajectories: Trajectories) -> LaplaceState:
         """The first state of the search that fits the likelihood."""
@@ -130,8 +129,7 @@ class Laplace(Estimator[LaplaceState]):
     def step(self, state: LaplaceState, trajectories: Trajectories) -> LaplaceState:
         """A step of the search, or, where it has ended, one more batch of draws."""
         windows = self.bound(trajectories)
-        first = not state.search.optima and self.near is None  # there is an estimate in any case
-        windows.deadline = Deadline() if first else self._deadline
+        windows.deadline = self._deadline if state.search.optima else Deadline()  # not before there is an estimate
         if state.draws is not None and isinstance(windows, Windows):
             assert isinstance(state.search, WindowState)
             windows.mask(state.search.wild)

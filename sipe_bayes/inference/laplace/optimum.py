@@ -92,9 +92,10 @@ def free_noise(windows: Windows) -> IntArray:
     return np.flatnonzero(np.concatenate([free, np.full(len(free), windows.settings.noise != "white")]))
 
 
-def same_noise(a: Noise, b: Noise) -> bool:
-    """Whether two are as good as equal."""
-    return bool(np.allclose(a.sd, b.sd, rtol=_SAME_NOISE) and np.allclose(a.tau, b.tau, rtol=3 * _SAME_NOISE))
+def gain_of_noise(moments: Moments, before: Noise, after: Noise) -> float:
+    """Nats by which the log-likelihood of a residual differs between two noises; slow ones hardly tell how slow."""
+    both = [float(moments.normal(n)[:, -1, -1].sum()) + moments.log_determinant(n) for n in (before, after)]
+    return 0.5 * abs(both[1] - both[0])
 
 
 def start_noise(windows: Windows) -> FloatArray:

@@ -17,7 +17,6 @@ class SolverTuning(Options):
     """How segments are fitted; see ``solver``."""
 
     damping: ClassVar[float] = 1e-3  # of the first step: nearly Gauss and Newton's
-    tolerance: ClassVar[float] = 0.05  # nats a parameter, gain of a step below which the fit has converged
     plain_gain: ClassVar[float] = 0.5  # the same of the plain fit
     most_steps: ClassVar[int] = 60  # from one starting point
     most_points: ClassVar[int] = 6  # with those found on the way
@@ -33,6 +32,11 @@ class SolverTuning(Options):
         True, "whether plain least squares takes over where coloured noise explains what it should not"
     )
 
+    @property
+    def tolerance(self) -> float:
+        """Nats a parameter, gain of a step below which the fit has converged; evidences differ by tens of nats."""
+        return 0.05 if self.compares else 0.2
+
 
 @dataclass(frozen=True)
 class LaplaceTuning(Options):
@@ -44,7 +48,9 @@ class LaplaceTuning(Options):
     importance: ImportanceTuning = option(ImportanceTuning(), "draws where the posterior is no normal")
 
 
-EVIDENCE_TUNING = LaplaceTuning(solver=SolverTuning(compares=False), importance=ImportanceTuning(wanted=False))
+EVIDENCE_TUNING = LaplaceTuning(
+    solver=SolverTuning(compares=False, linearised_steps=1e5), importance=ImportanceTuning(wanted=False)
+)
 """Of fits whose evidences are compared: those of different noise do not compare."""
 
 

@@ -69,8 +69,8 @@ from sipe_bayes.inference.laplace.optimum import (
     WindowOptimum,
     WindowState,
     beyond_known_noise,
+    gain_of_noise,
     present_noise,
-    same_noise,
     summarised,
     updated_noise,
 )
@@ -217,10 +217,6 @@ class SegmentSolver:
         """The first state: at the model as given, or at the starting point that the options name."""
         options, nominal = self.problem.options, np.clip(self.problem.space.default_theta, 0, 1)
         residual, valid = None, True
-        if (near := self.problem.near) is not None and near.starts is not None and options.initial is not None:
-            here, part = self._begin(options.initial[0]), len(self._beginnings) + 1
-            here = replace(here, stage=Stage.FIT, part=part, starts=near.starts, noise=near.noise, iteration=1)
-            return SolverState(options.initial, 0, here, wild=near.outliers)
         if options.initial is not None:
             points = options.initial
         elif self._beginnings and options.restarts > 1 and self._may_screen():
@@ -561,7 +557,7 @@ class SegmentSolver:
         after = replace(after, exact=exact, scale=scale, axes=axes)
         slow = trial.gained < tolerance and (here.damping <= 1.0 or here.gained < tolerance)
         small = trial.expected < tolerance or slow
-        settled = small and (same_noise(noise, here.noise) or _gain_of_noise(moments, here.noise, noise) < tolerance)
+        settled = small and gain_of_noise(moments, here.noise, noise) < tolerance
         stuck = trial.gained <= 0 and here.damping >= 1e3
         elsewhere = bool(np.isfinite(state.ends).any()) and after.iteration >= _SCOUTED_STEPS
         last = elsewhere or after.iteration >= self.tuning.most_steps or self._leaves_no_room()
@@ -1013,17 +1009,6 @@ def best_step(
     lowest = float(values.min())
     best = int(np.flatnonzero(values <= lowest + min(slack, max(0.5 * (now - lowest), 0.0)))[-1])
     return best, residuals, values
-
-
-def _gain_of_noise(moments: Moments, before: Noise, after: Noise) -> float:
-    """Nats by which the log-likelihood of a residual differs between two noises.
-
-    Slow ones hardly tell their correlation times, which may then change without an end.
-    """
-    levels = [
-        float(moments.normal(noise)[:, -1, -1].sum()) + moments.log_determinant(noise) for noise in (before, after)
-    ]
-    return 0.5 * abs(levels[1] - levels[0])
 
 
 def _log_errors(view: Windows, residual: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Finding
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.inference.laplace.options import LaplaceOptions
-from sipe_bayes.likelihood import FLAT_PRECISION, FitResult, QuadraticPrior
+from sipe_bayes.likelihood import FLAT_PRECISION, QuadraticPrior
 from sipe_bayes.likelihood.block_tridiagonal import inverse
 from sipe_bayes.posterior import GaussianMixture, Posterior
 
@@ -81,8 +81,6 @@ class SearchProblem:
         prior: over theta.
         seed: of whatever is drawn.
         options: of ``laplace``.
-        near: a fit of a model with a few parameters more or less, from whose initial states and noise, and without
-            whose outliers, segments are fitted.
         find: notes a finding.
         tell: called within a long step with what is being done, and the rollouts so far.
     """
@@ -92,7 +90,6 @@ class SearchProblem:
     seed: int
     options: LaplaceOptions
     find: Callable[[Finding], None]
-    near: FitResult | None = None
     tell: Callable[[str, int], None] = lambda what, rollouts: None
 
     @cached_property

@@ -117,7 +117,7 @@ def ties(discovery: Discovery) -> Verdict | None:
         would = "Logs cut to where they differ, or other motions," if parts else "More logs, or other motions,"
         texts.append(f"These structures predict the logs as well: {listed([*others[:_NAMED], *more])}.")
         texts.append(f"The simplest of them, {structure_text(best)}, is written to discovered.xml. {would} may tell.")
-    larger = max((row for row in discovery.rows if not row.yardstick), key=lambda row: row.gain)
+    larger = max(discovery.rows, key=lambda row: row.gain)
     if not larger.tied and larger.gain > best.gain and set(best.labels) < set(larger.labels):
         added = listed(
             [x for x, label in zip(larger.sentences, larger.labels, strict=True) if label not in best.labels]
@@ -128,19 +128,16 @@ def ties(discovery: Discovery) -> Verdict | None:
 
 
 def remains(discovery: Discovery) -> Verdict | None:
-    """Whether what the best structure leaves passes for noise, and what share the pieces with a name have."""
-    misfit, share = discovery.after.misfit, discovery.named_share
-    explained = ""
-    if share is not None and share < 1:
-        explained = f" Pieces with a name explain {100 * share:.0f} % of what a force without one would."
+    """Whether what the best structure leaves passes for noise."""
+    misfit = discovery.after.misfit
     if misfit is None:
-        return Verdict("fair", f"Whether the residuals pass for noise cannot be told.{explained}")
+        return Verdict("fair", "Whether the residuals pass for noise cannot be told.")
     p = f"({misfit.p_text})"
     if not misfit.alarm:
-        return Verdict("good", f"What remains passes for noise {p}.{explained}")
+        return Verdict("good", f"What remains passes for noise {p}.")
     if discovery.passes:
-        return Verdict("fair", f"What remains is not quite noise {p}: something small, like {misfit.cause}.{explained}")
-    return Verdict("bad", f"What remains is not noise {p}; it looks most like {misfit.cause}.{explained}")
+        return Verdict("fair", f"What remains is not quite noise {p}: something small, like {misfit.cause}.")
+    return Verdict("bad", f"What remains is not noise {p}; it looks most like {misfit.cause}.")
 
 
 def trust(discovery: Discovery) -> Verdict:

@@ -124,7 +124,7 @@ class Row(Extension):
     alike: bool = False
     imitator: str = ""
     needs: Callable[[Machine, str], bool] = lambda machine, site: True
-    last_resort: bool = False
+    by_name: bool = False
 
     def sentence(self, site: str) -> str:
         """What it is."""

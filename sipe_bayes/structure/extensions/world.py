@@ -274,7 +274,7 @@ class Residual(Extension):
 
     name, kind = "residual", "joint"
     reference = "A. Rahimi, B. Recht 2007, Random Features for Large-Scale Kernel Machines"
-    native, last_resort = False, True
+    native, by_name = False, True
     scales = ("residual_position", "residual_velocity", "residual_command")
 
     def sentence(self, site: str) -> str:
