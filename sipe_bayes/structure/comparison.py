@@ -14,7 +14,8 @@ Deviation from Vehtari et al., whose s^2 = K var(d): motions differ in what they
 one sign, but differ, is no uncertain one.
 
 Structures within two standard errors of the best are **ties**. The set that is reported are those ties of which no
-part is a tie itself: an extension that is not needed is not reported. **Stacking weights** of a set maximise the mean
+part is a tie itself: an extension that is not needed is not reported. A structure that predicts held-out logs worse
+than the plain model by more than a standard error is none of them. **Stacking weights** of a set maximise the mean
 log of the weighted mixture (Y. Yao, A. Vehtari, D. Simpson, A. Gelman 2018, https://doi.org/10.1214/17-BA1091).
 """
 
@@ -51,11 +52,14 @@ def rank(one: FittedStructure) -> tuple[int, float]:
     return -lost, float(density[np.isfinite(density)].sum())
 
 
-def difference(one: FittedStructure, other: FittedStructure) -> Difference:
-    """How much better a structure predicts than another; infinite where one of them diverges on more pieces."""
+def difference(one: FittedStructure, other: FittedStructure, since: int = 0) -> Difference:
+    """How much better a structure predicts than another; infinite where one of them diverges on more pieces.
+
+    since: the first of the logs whose pieces count.
+    """
     if (kept := rank(one)[0] - rank(other)[0]) != 0:
         return Difference(kept * np.inf, 0.0)
-    both = np.isfinite(one.held.density) & np.isfinite(other.held.density)
+    both = np.isfinite(one.held.density) & np.isfinite(other.held.density) & (one.held.log >= since)
     each, log = (one.held.density - other.held.density)[both], one.held.log[both]
     total = float(each.sum())
     opposing, follows = each[each * total < 0], log[1:] == log[:-1]

@@ -26,14 +26,13 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.budget import BudgetExhausted, BudgetTooSmall, Deadline
-from sipe_bayes.inference.recorded import Progress
-from sipe_bayes.likelihood import BoundLikelihood, QuadraticPrior
+from sipe_bayes.inference.recorded import Progress, Tell
+from sipe_bayes.likelihood import QuadraticPrior
 from sipe_bayes.structure.augmented import AugmentedModel
 from sipe_bayes.structure.candidates import Candidate, gain_of_steps, rank_candidates
 from sipe_bayes.structure.columns import Column, channels_of, choices, is_explained, log_jacobian, moving, unexplained
@@ -125,7 +124,9 @@ class StructureSearch:
             native = all(self._placed[label].extension.native for label in one.labels)
             return len(one.labels), not native, -rank(one)[1]
 
-        counted = [one for one in state.fitted if one.labels != state.cut_off]
+        plain, held = state.fitted[0], len(self.fitting.trajectories)
+        worse = [(gain := difference(plain, one, held)).nats > gain.error for one in state.fitted]
+        counted = [one for one, bad in zip(state.fitted, worse, strict=True) if one.labels != state.cut_off and not bad]
         return sorted(choose_ties(counted, self._contains), key=simple)
 
     def _contains(self, one: FittedStructure, other: FittedStructure) -> bool:
@@ -262,12 +263,13 @@ class StructureSearch:
         taken = {*here.labels, *(t for p in own for q in p.parameters for t in q.targets)}
         rest = [p for p in self._placed.values() if p.parameters]
         rest = [p for p in rest if not taken & {p.label, *(t for q in p.parameters for t in q.targets)}]
-        windows.budget, ranked, cut, gain = self._left(state), list[Candidate](), None, 0.0
+        windows.budget, ranked, cut, gain = max(self.budget - state.rollouts, 0), list[Candidate](), None, 0.0
         windows.deadline = Deadline(fitting.ends)
         finer = self._ladder.finer(here.labels)
         try:
             if rest or finer is not None:
-                at, tell = (here.theta, here.noise, here.starts, prior), partial(self._simulating, windows)
+                at = here.theta, here.noise, here.starts, prior
+                tell: Tell = lambda what: self._tell(what, windows.rollouts)  # noqa: E731
                 logs = AugmentedModel(windows, *at, tell=tell, placed=rest, shorter=finer is not None)
                 ranked = rank_candidates(logs)
                 gain = 0.0 if finer is None else gain_of_steps(logs)
@@ -281,13 +283,6 @@ class StructureSearch:
             offers = (*offers, Offer(here.labels, finer[-1], gain, np.zeros(0), here.theta))
         done = (*state.ranked, here.labels) if cut is None else state.ranked
         return replace(state, offers=state.offers + offers, ranked=done, rank_rollouts=ranks, cut=cut)
-
-    def _simulating(self, windows: BoundLikelihood, what: str) -> None:
-        self._tell(what, windows.rollouts)
-
-    def _left(self, state: DiscoverState) -> int:
-        """Rollouts of the budget."""
-        return max(self.budget - state.rollouts, 0)
 
     def _fit(self, state: DiscoverState) -> DiscoverState:
         labels, *rest = state.queue
@@ -331,7 +326,7 @@ class StructureSearch:
         return own + [label for label in one.labels for _ in self._placed[label].parameters]
 
     def _fitted(self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray) -> DiscoverState:
-        left, cut = self._left(state), None
+        left, cut = max(self.budget - state.rollouts, 0), None
         self._rollouts, self._fit_rollouts = state.rollouts, 0
         try:
             most = self.enough(labels)

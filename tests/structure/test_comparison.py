@@ -104,7 +104,7 @@ def test_stacking_weights_maximise_the_mixture() -> None:
 def search_of(*fitted: FittedStructure) -> tuple[StructureSearch, list[FittedStructure]]:
     """A search whose fits are those of structures that are given, by their labels; and those that were asked for."""
     fitting: Any = SimpleNamespace(
-        ends=np.inf, holdout=None, corrected=lambda columns: fitting, simulator=lambda pieces: None
+        ends=np.inf, trajectories=[0], holdout=None, corrected=lambda columns: fitting, simulator=lambda pieces: None
     )
     search, asked = StructureSearch(fitting, ()), list[FittedStructure]()
     named = SimpleNamespace(extension=SimpleNamespace(native=True), parameters=(None,))
@@ -137,6 +137,17 @@ def test_a_beam_finds_what_the_first_choice_hides() -> None:
         state = {Phase.RANK: search._rank, Phase.FIT: search._fit, Phase.PRUNE: search._prune}[state.phase](state)
     assert {one.labels for one in asked} >= {("a",), ("c",), ("a", "b"), ("b",)}
     assert [one.labels for one in search.supported(state)] == [("a", "b")]
+
+
+@pytest.mark.parametrize(("held_out", "kept"), [(1.0, "a"), (-1.0, "")])
+def test_what_predicts_held_out_logs_worse_is_not_in_the_set(held_out: float, kept: str) -> None:
+    """However much better it predicts pieces of the training log."""
+    pieces = [20.0] * 10 + [held_out] * 10
+    search, _ = search_of()
+    log = np.repeat([0, 1], 10)
+    fitted = [structure("", *np.zeros(20)), structure("a", *pieces)]
+    fitted = [replace(one, held=replace(one.held, log=log)) for one in fitted]
+    assert [one.labels for one in search.supported(DiscoverState(Phase.DONE, tuple(fitted)))] == [tuple(kept)]
 
 
 @pytest.mark.parametrize(("theta", "wide"), [(0.7, True), (0.42, False), (0.0, False)])
