@@ -3,10 +3,11 @@
     python examples/studies/discover_real.py                        # both; some quarter of an hour on two cores
     python examples/studies/discover_real.py --examples simple_pendulum
 
-`sipe discover` searches, then `sipe calibrate` fits the model as given and the discovered configuration, both with the
-example's own noise model. Errors are root-mean-square over open-loop windows from measured starts. Searches go on from
-runs/ where they were interrupted; results/discover_real.json holds what is found, evidence, held-out errors, whether
-the residuals pass for noise, rollouts and seconds.
+`sipe discover` searches by discover.toml, or by calibrate.toml where there is none. Then `sipe calibrate` fits that
+configuration and the discovered one, both with the example's own noise model. Errors are root-mean-square over
+open-loop windows from measured starts. Searches go on from runs/ where they were interrupted;
+results/discover_real.json holds what is found, held-out errors, whether the residuals pass for noise, rollouts and
+seconds.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ def residuals(misfit: Misfit | None) -> dict[str, Any] | None:
 
 def studied(name: str) -> dict[str, Any]:
     """One example."""
-    config, out = HERE.parent / name / "calibrate.toml", HERE / "runs" / f"discover_{name}"
+    folder, out = HERE.parent / name, HERE / "runs" / f"discover_{name}"
+    config = next(file for file in (folder / "discover.toml", folder / "calibrate.toml") if file.is_file())
     found = run_discovery(config, out, progress=lambda *told: print(*told, flush=True))
     best, *others = found.rows
     before, after = calibrated(config), calibrated(out / DISCOVERED_TOML)

@@ -60,7 +60,7 @@ def difference(one: FittedStructure, other: FittedStructure, since: int = 0) -> 
     if (kept := rank(one)[0] - rank(other)[0]) != 0:
         return Difference(kept * np.inf, 0.0)
     both = np.isfinite(one.held.density) & np.isfinite(other.held.density) & (one.held.log >= since)
-    each, log = (one.held.density - other.held.density)[both], one.held.log[both]
+    each, log = one.held.density[both] - other.held.density[both], one.held.log[both]
     total = float(each.sum())
     opposing, follows = each[each * total < 0], log[1:] == log[:-1]
     apart = each - each.mean() if len(each) else each

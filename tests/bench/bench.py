@@ -27,7 +27,6 @@ import batch
 import ddpg
 import envs
 import everyday
-import executors
 import fits
 import laws
 import mujoco
@@ -245,7 +244,7 @@ def chain() -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     tables = (
-        *("engine", "batch", "rival", "stages", "chain", "envs", "memory", "fits", "ddpg", "laws", "executors"),
+        *("engine", "batch", "rival", "stages", "chain", "envs", "memory", "fits", "ddpg", "laws"),
         *("discover", "transfer", "shapes", "everyday"),
     )
     parser.add_argument("tables", nargs="*", help=f"any of {', '.join(tables)}; default all")
@@ -268,8 +267,6 @@ def main() -> None:
             fits.table()
         elif name == "ddpg":
             ddpg.table(given.pairs, side_by_side)
-        elif name == "executors":
-            executors.table()
         elif name == "everyday":
             everyday.table()
         elif name == "laws":

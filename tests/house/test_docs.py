@@ -105,6 +105,16 @@ def test_readme_is_short() -> None:
     assert not [line for line in lines if len(line) > 120]
 
 
+@pytest.mark.parametrize("name", ["simple_pendulum", "furuta_pendulum"])
+def test_examples_print_what_the_study_found(name: str) -> None:
+    """Of examples/studies/discover_real.py: what, by how much, and the error on each held-out log before and after."""
+    found = json.loads((ROOT / "examples" / "studies" / "results" / "discover_real.json").read_text())[name]
+    page = " ".join((ROOT / "examples" / name / "README.md").read_text(encoding="utf-8").split())
+    errors = [f"{log['before']:.3f} to {log['after']:.3f}" for log in found["by log"]]
+    expected = [*found["found"], f"{found['gain']:.0f} ± {found['error']:.0f} nats", *errors]
+    assert [text for text in expected if text not in page] == []
+
+
 def test_pictures_are_small() -> None:
     folder = ROOT / "examples" / "simple_pendulum"
     assert (folder / "figure.png").stat().st_size < 150_000

@@ -13,12 +13,12 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace import Laplace
-from sipe_bayes.likelihood import FLAT_PRECISION, Noise, QuadraticPrior, Segments
+from sipe_bayes.likelihood import Noise, QuadraticPrior, Segments
 from sipe_bayes.likelihood.restricted import marginal
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.scores import Scores, scores
+from sipe_bayes.structure.scores import Scores, _Linear, scores
 from tests.problems.pendulums import log, pendulum
 
 XML = """<mujoco><option timestep="0.02" gravity="0 0 0"/><worldbody>
@@ -90,13 +90,11 @@ def ours(windows: Windows, rho: float) -> tuple[float, float]:
 def at_optimum(windows: Windows, rho: float) -> Scores:
     """Scores where one step of the linear model leads."""
     noise = Noise(np.array([SD]), np.array([-DT / np.log(rho) if rho else 0.0]))
-    prior, n = QuadraticPrior.of(default_prior(windows.simulator.space)), windows.num_theta
-    theta, starts = np.full(n, 0.4), windows.no_starts()
+    prior = QuadraticPrior.of(default_prior(windows.simulator.space))
+    theta, starts = np.full(windows.num_theta, 0.4), windows.no_starts()
     normal = windows.moments(windows.linearise(theta, starts)).normal(noise)
-    solved, inner = windows.eliminate(normal, n), prior.precision + FLAT_PRECISION * np.eye(n)
-    pull = solved.gradient + prior.pull(theta) + FLAT_PRECISION * (0.5 - theta)
-    move = np.linalg.solve(solved.precision + inner, pull)
-    return scores(windows, theta + move, starts + solved.blocks(move), noise, prior)
+    move, own = _Linear(windows, theta, starts, prior).step(normal)
+    return scores(windows, theta + move, starts + own, noise, prior)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.7])
