@@ -1006,6 +1006,7 @@ def best_step(
     residuals, valid = view.residuals(thetas, starts)
     each = zip(thetas, starts, residuals, valid, strict=True)
     values = np.array([energy(t, s, r) if ok else np.inf for t, s, r, ok in each])
+    values[np.isnan(values)] = np.inf  # steps from where the simulation diverges
     lowest = float(values.min())
     best = int(np.flatnonzero(values <= lowest + min(slack, max(0.5 * (now - lowest), 0.0)))[-1])
     return best, residuals, values
