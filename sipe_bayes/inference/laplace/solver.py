@@ -1006,8 +1006,10 @@ def best_step(
     residuals, valid = view.residuals(thetas, starts)
     each = zip(thetas, starts, residuals, valid, strict=True)
     values = np.array([energy(t, s, r) if ok else np.inf for t, s, r, ok in each])
-    values[np.isnan(values)] = np.inf  # steps from where the simulation diverges
+    values[np.isnan(values)] = np.inf
     lowest = float(values.min())
+    if lowest == np.inf:  # as where the simulation diverges from here on
+        return len(values) - 1, residuals, values
     best = int(np.flatnonzero(values <= lowest + min(slack, max(0.5 * (now - lowest), 0.0)))[-1])
     return best, residuals, values
 
