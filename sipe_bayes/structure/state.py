@@ -19,7 +19,7 @@ BUDGET = 30_000  # rollouts by default: structures with two pieces of a machine 
 class DiscoverOptions(Options):
     """How structures are searched."""
 
-    width: int = option(3, "candidates that are fitted in a round; in the first twice as many if alike", least=1)
+    width: int = option(3, "candidates that are fitted in a round; in the first twice as many", least=1)
     beam: int = option(2, "structures that each round extends", least=1)
     most: int = option(5, "extensions that a structure may have", least=1)
     least_gain: float = option(5.0, "predicted gain from which an extension is fitted", "nats", above=0)

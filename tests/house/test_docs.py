@@ -110,7 +110,7 @@ def test_examples_print_what_the_study_found(name: str) -> None:
     """Of examples/studies/discover_real.py: what, by how much, and the error on each held-out log before and after."""
     found = json.loads((ROOT / "examples" / "studies" / "results" / "discover_real.json").read_text())[name]
     page = " ".join((ROOT / "examples" / name / "README.md").read_text(encoding="utf-8").split())
-    errors = [f"{log['before']:.3f} to {log['after']:.3f}" for log in found["by log"]]
+    errors = [f"{row['before']:.4f} to {row['after']:.4f}" for row in found["held-out errors"]]
     expected = [*found["found"], f"{found['gain']:.0f} ± {found['error']:.0f} nats", *errors]
     assert [text for text in expected if text not in page] == []
 

@@ -181,7 +181,7 @@ class SensorFilter(Extension):
 
     @staticmethod
     def _slowest(dt: float) -> float:
-        return min(0.1, 20 * dt)
+        return min(0.05, 20 * dt)
 
     def imitators(self, site: str) -> tuple[str, ...]:
         """A delay."""
