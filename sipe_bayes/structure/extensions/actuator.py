@@ -130,7 +130,7 @@ class Gain(Extension):
 
     def sentence(self, site: str) -> str:
         """What it is."""
-        return f"a gain of {site} that is not the model's"
+        return f"a gain error of {site}"
 
     def wholes(self, machine: Machine, site: str) -> tuple[float, ...]:
         """All of it."""

@@ -21,7 +21,7 @@ class Mass(Extension):
 
     def sentence(self, site: str) -> str:
         """What it is."""
-        return f"a mass of {site} that is not the model's"
+        return f"a mass error of {site}"
 
     def wholes(self, machine: Machine, site: str) -> tuple[float, ...]:
         """All of it."""
@@ -79,7 +79,7 @@ class CentreOfMass(Extension):
 
     def sentence(self, site: str) -> str:
         """What it is."""
-        return f"a centre of mass of {site} that is not the model's"
+        return f"a centre of mass offset of {site}"
 
     def wholes(self, machine: Machine, site: str) -> tuple[float, ...]:
         """How far its mass lies from what turns it."""

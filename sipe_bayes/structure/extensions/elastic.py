@@ -33,7 +33,7 @@ class GearCompliance(Extension):
 
     def sentence(self, site: str) -> str:
         """What it is."""
-        return f"a gear at {site} that gives way"
+        return f"gear compliance at {site}"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """From rigid to a spring whose resonance lies at twice the frequency of the motion; and its loss."""
@@ -71,7 +71,7 @@ class LinkCompliance(Extension):
 
     def sentence(self, site: str) -> str:
         """What it is."""
-        return f"a link or shaft that gives way behind {site}"
+        return f"link or shaft compliance behind {site}"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """From rigid to a spring whose resonance lies at twice the frequency of the motion; and its loss."""

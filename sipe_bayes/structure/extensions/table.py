@@ -179,7 +179,7 @@ _ROWS = (
         (Unknown("dry_friction", 0.0, lambda s: s.force, "level of dry friction", "frictionloss"),),
     ),
     Row(
-        "armature", "joint", "inertia of a rotor at {}", "MuJoCo documentation, joint armature",
+        "armature", "joint", "armature (rotor inertia) at {}", "MuJoCo documentation, joint armature",
         (Unknown("armature", 0.0, lambda s: s.inertia, "reflected inertia"),),
     ),
     Row(
@@ -211,7 +211,7 @@ _ROWS = (
         tried=_SPRING,
     ),
     Row(
-        "hardening_spring", "joint", "a spring that hardens at {}", _POLYNOMIAL,
+        "hardening_spring", "joint", "a hardening spring at {}", _POLYNOMIAL,
         (
             Unknown(
                 "spring_quadratic", lambda s: -s.force / s.position**2, lambda s: s.force / s.position**2,
@@ -224,7 +224,7 @@ _ROWS = (
         ),
     ),
     Row(
-        "direction_friction", "joint", "friction at {} that differs by direction",
+        "direction_friction", "joint", "direction-dependent friction at {}",
         "B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit 1994, https://doi.org/10.1016/0005-1098(94)90209-7",
         (
             Unknown(
@@ -239,7 +239,7 @@ _ROWS = (
         "joint frictionloss and damping, alike both ways", native=False,
     ),
     Row(
-        "stribeck", "joint", "friction at {} that is larger at low speed (Stribeck)",
+        "stribeck", "joint", "Stribeck friction at {}",
         "R. Stribeck 1902; H. Olsson et al. 1998, https://doi.org/10.1016/S0947-3580(98)70113-X",
         (
             Unknown("stribeck_friction", 0.0, lambda s: s.force, "dry friction at rest above that at speed"),
@@ -251,7 +251,7 @@ _ROWS = (
         _LUGRE, native=False, tried=(((PROBE, 0.25),), ((PROBE, 0.5),), ((PROBE, 0.75),)),
     ),
     Row(
-        "presliding", "joint", "friction at {} that is built up over a small distance (presliding)",
+        "presliding", "joint", "presliding friction at {}",
         "P. R. Dahl 1968, A solid friction model; C. Canudas de Wit et al. 1995, https://doi.org/10.1109/9.376053",
         (
             Unknown("presliding_friction", 0.0, lambda s: s.force, "level of dry friction"),
@@ -275,7 +275,7 @@ _ROWS = (
         "joint springyield, one elasto-plastic spring", native=False, tried=_OVER_RANGES,
     ),
     Row(
-        "load_friction", "joint", "friction at {} that grows with its load",
+        "load_friction", "joint", "load-dependent friction at {}",
         "M. Duclusaud et al. 2024, https://arxiv.org/abs/2410.08650",
         (Unknown("load_friction", 0.0, 1.0, "share of the transmitted torque"),),
         "joint frictionloss, at its mean over the motion", native=False,
@@ -339,7 +339,7 @@ _ROWS = (
         _MEAN_GAIN, native=False, alike=True,
     ),
     Row(
-        "power", "actuator", "a force of {} that goes with a power of its command", _FOSSEN,
+        "power", "actuator", "a force of {} that follows a power of its command", _FOSSEN,
         (
             Unknown(
                 "exponent", 1 / 2.5, 2.5, "power of the command that the force goes with", scale="log"

@@ -279,7 +279,7 @@ class Residual(Extension):
 
     def sentence(self, site: str) -> str:
         """What it is."""
-        return f"a force at {site} that nothing here has a name for"
+        return f"an unstructured residual force at {site}"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """Twelve weights, with normal priors of a tenth of the usual force."""
