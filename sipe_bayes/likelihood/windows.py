@@ -485,6 +485,7 @@ class Windows:
                 rest &= ~better
                 if not rest.any():
                     break
+            energy = energies(starts, residual)  # a window's first sample is whitened by the last one before it
             if not energy.sum() < (1 - _SETTLED) * before:
                 break
         return starts, residual, valid

@@ -199,7 +199,7 @@ class TruncatedNormal:
     """
 
     scrambles: ClassVar[int] = 8  # Sobol sequences, whose spread is the error
-    points: ClassVar[int] = 2**12  # of each sequence
+    points: int = 2**12  # of each sequence
     rejection_mass: ClassVar[float] = 0.05  # above it plain draws are thrown away until enough are inside
     least_acceptance: ClassVar[float] = 1e-3  # of tilted draws, below which Markov chains take their place
     chains: ClassVar[int] = 500

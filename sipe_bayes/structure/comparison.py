@@ -53,10 +53,7 @@ def rank(one: FittedStructure) -> tuple[int, float]:
 
 
 def difference(one: FittedStructure, other: FittedStructure, since: int = 0) -> Difference:
-    """How much better a structure predicts than another; infinite where one of them diverges on more pieces.
-
-    since: the first of the logs whose pieces count.
-    """
+    """How much better one predicts logs from ``since`` on than another; infinite where one diverges on more pieces."""
     if (kept := rank(one)[0] - rank(other)[0]) != 0:
         return Difference(kept * np.inf, 0.0)
     both = np.isfinite(one.held.density) & np.isfinite(other.held.density) & (one.held.log >= since)

@@ -24,7 +24,6 @@ from sipe_bayes.structure.columns import Column, corrected
 from sipe_bayes.structure.extension import Placed, extended
 from sipe_bayes.structure.scores import Pieces, predictive, scores
 
-# structures differ by nats, and where friction has kinks the last ones come in ever smaller steps
 _STEPS = 40  # of a fit, which takes twenty to thirty
 _EDGE = 1e-3  # of the cube: at a bound
 _FLAT_SD = 1e3  # of the cube: stands for a uniform prior beside a normal one
@@ -62,11 +61,7 @@ class FittedStructure:
 
     @property
     def spanned(self) -> FloatArray:
-        """The covariance (N + P, N + P), which reaches as far as the optimum where that lies beyond a sd.
-
-        Where simulations are rough, the linearisation at the optimum points elsewhere, with an interval that does not
-        hold it. At a bound the normal's mean may lie behind that.
-        """
+        """The covariance (N + P, N + P), which reaches as far as an optimum beyond a sd: simulations are rough."""
         inside = (self.theta > _EDGE) & (self.theta < 1 - _EDGE)
         gap = np.where(inside, self.theta - self.mean, 0.0)
         far = np.abs(gap) > np.sqrt(np.diag(self.covariance))
@@ -149,14 +144,15 @@ class Fitting:
         left = max(budget - self._scoring(windows), 1)
         best, rollouts = self._optimum(simulator, prior, initial, left, progress)
         assert best.starts is not None
-        both = scores(windows, best.theta, best.starts, best.noise, QuadraticPrior.of(prior))
-        pieces = both.pieces
+        evidence, pieces = scores(windows, best.theta, best.starts, best.noise, QuadraticPrior.of(prior))
         if self.holdout is not None:
             held = BoundLikelihood(self.likelihood, simulator, self.holdout)
-            inside = (best.theta > _EDGE) & (best.theta < 1 - _EDGE)  # a step that was not taken is none
-            mean = np.where(inside, best.theta, best.mean)
+            pull = np.linalg.solve(best.covariance, best.mean - best.theta)
+            pull[(best.theta > _EDGE) & (best.theta < 1 - _EDGE)] = 0.0  # a step that was not taken is none
+            mean = best.theta + best.covariance @ pull
             posterior = GaussianMixture(torch.zeros(1), mean[None], best.covariance[None], simulator.space)
-            pieces = pieces.beside(predictive(held, best.theta, best.noise, QuadraticPrior.of(posterior)))
+            own = predictive(held, best.theta, best.noise, QuadraticPrior.of(posterior))
+            pieces = pieces.beside(own, len(self.trajectories))
             windows.rollouts += held.rollouts
         return FittedStructure(
             tuple(one.label for one in placed),
@@ -166,7 +162,7 @@ class Fitting:
             best.noise.sd,
             best.noise.tau,
             best.starts,
-            both.evidence,
+            evidence,
             pieces,
             rollouts + windows.rollouts,
             best.finding is None,

@@ -105,11 +105,7 @@ class StepError:
 
 
 def shorter_steps(windows: BoundLikelihood) -> list[Placed]:
-    """Pieces of a model that have no parameters: a quarter of its physics step, and a quarter of that.
-
-    Of the error of Euler's steps they leave as much. None where the model does not compile with them, or no longer has
-    the states that logs recorded.
-    """
+    """A quarter of the model's physics step, and a quarter of that; none where it does not compile with the logs."""
     environment, pieces = windows.simulator.environment, list[Placed]()
     assert isinstance(environment, MjcfEnvironment)
     step = float(windows.simulator.model.opt.timestep)

@@ -20,13 +20,15 @@ Deviations:
 
 - The noise is that of the fit to all training logs. Pieces are compared as if noise began anew in each.
 - Directions that the data leave open get the flat normal of ``likelihood.quadratic_prior``.
-- g is zero but at a bound: where simulations are rough, slopes promise gains that the search did not find.
+- g is the slope less what it was where the search ended, but at a bound: where simulations are rough, slopes promise
+  gains that the search did not find.
 """
 
 from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
@@ -52,16 +54,15 @@ class Pieces:
     log: IntArray
     square: FloatArray
 
-    def beside(self, other: Pieces) -> Pieces:
-        """These, and pieces of other logs, which are counted on."""
-        log = np.concatenate([self.log, other.log + self.log.max(initial=-1) + 1])
+    def beside(self, other: Pieces, first: int) -> Pieces:
+        """These, and pieces of other logs, which are counted on from ``first``."""
+        log = np.concatenate([self.log, other.log + first])
         both = zip((self.density, self.square), (other.density, other.square), strict=True)
         density, square = (np.concatenate(pair) for pair in both)
         return Pieces(density, log, square)
 
 
-@dataclass(frozen=True)
-class Scores:
+class Scores(NamedTuple):
     """Of one structure: its evidence log p(y) in nats, and its pieces; without pieces the evidence is one."""
 
     evidence: float
@@ -86,7 +87,6 @@ def scores(
     linearisation = windows.linearise(theta, starts)
     if not linearisation.valid:
         raise ValueError("theta: the simulation diverges at the optimum")
-    # one block for each window also where starts are known
     products, constants = windows.moments(linearisation).normal(noise), _log_determinants(windows, noise)
     linear = _Linear(windows, theta, starts, prior)
     linear = replace(linear, untaken=linear.step(products))
@@ -150,9 +150,11 @@ class _Linear:
         if self.untaken is None:
             return products
         n, d, (move, own) = len(self.theta), self.windows.num_start, self.untaken
-        step = np.concatenate([np.tile(move, (len(products), 1)), own, np.roll(own, 1, axis=0)], axis=1)
-        change = np.einsum("wij,wj->wi", products[:, :-1, :-1], step)
-        change[:, n : n + d] += own * self.windows.start_precision
+        step, change = np.tile(move, (len(products), 1)), np.zeros((len(products), n + 2 * d))
+        if d:  # else products are of all windows together
+            step = np.concatenate([step, own, np.roll(own, 1, axis=0)], axis=1)
+            change[:, n : n + d] = own * self.windows.start_precision
+        change += np.einsum("wij,wj->wi", products[:, :-1, :-1], step)
         products = products.copy()
         products[:, :-1, -1] -= change
         products[:, -1, :-1] -= change
@@ -206,17 +208,20 @@ class _Linear:
         return 0.5 * len(own) * float(np.log(2 * np.pi)) - 0.5 * float(np.linalg.slogdet(precision)[1]) + mass
 
 
-class _RoughMass(TruncatedNormal):
-    """Of a mass that is known to a hundredth of a nat: evidences are compared by nats."""
-
-    points = 2**8
-
-
 def _log_mass(mean: FloatArray, covariance: FloatArray) -> float:
     """Log of a normal's mass in the cube, by the parameters (N,) of which that cuts off more than a thousandth."""
     sd = np.sqrt(np.diag(covariance))
-    cut = np.flatnonzero(ndtr(-mean / sd) + ndtr((mean - 1) / sd) > 1e-3)
-    return _RoughMass(mean[cut], covariance[np.ix_(cut, cut)]).log_mass
+    cut, shifted = np.zeros(0, int), mean
+    for _ in range(len(mean)):  # what is cut off of one may push others against their bounds
+        far = ndtr(-shifted / sd) + ndtr((shifted - 1) / sd) > 1e-3
+        before, cut = cut, np.union1d(cut, np.flatnonzero(far)).astype(int)
+        if len(cut) == len(before):
+            break
+        gap = np.clip(mean[cut], 0, 1) - mean[cut]
+        shifted = mean + covariance[:, cut] @ np.linalg.solve(covariance[np.ix_(cut, cut)], gap)
+    within = TruncatedNormal(mean[cut], covariance[np.ix_(cut, cut)])
+    within.points = 2**8  # to a hundredth of a nat
+    return within.log_mass
 
 
 def _log_determinants(windows: BoundLikelihood, noise: Noise) -> FloatArray:

@@ -123,16 +123,19 @@ class StructureSearch:
             native = all(self._placed[label].extension.native for label in one.labels)
             return len(one.labels), not native, -rank(one)[1]
 
+        return sorted(choose_ties(self._counted(state), self._contains), key=simple)
+
+    def _counted(self, state: DiscoverState) -> list[FittedStructure]:
+        """Those fitted to the end that predict held-out logs not worse than the plain model by a standard error."""
         plain, held = state.fitted[0], len(self.fitting.trajectories)
         worse = [(gain := difference(plain, one, held)).nats > gain.error for one in state.fitted]
-        counted = [one for one, bad in zip(state.fitted, worse, strict=True) if one.labels != state.cut_off and not bad]
-        return sorted(choose_ties(counted, self._contains), key=simple)
+        return [one for one, bad in zip(state.fitted, worse, strict=True) if one.labels != state.cut_off and not bad]
 
     def _contains(self, one: FittedStructure, other: FittedStructure) -> bool:
         """Whether a structure has all of another one and more; shorter integration steps contain longer ones."""
-        pieces, rungs = self._ladder.pieces, [self._ladder.rung(each.labels) for each in (other, one)]
-        within = set(pieces(other.labels)) <= set(pieces(one.labels)) and rungs[0] <= rungs[1]
-        return within and set(one.labels) != set(other.labels)
+        less, more = (set(self._ladder.pieces(each.labels)) for each in (other, one))
+        finer = self._ladder.rung(other.labels) <= self._ladder.rung(one.labels)
+        return less <= more and finer and set(one.labels) != set(other.labels)
 
     def enough(self, labels: Sequence[str]) -> int:
         """Rollouts that the fit of a structure may have."""
@@ -305,7 +308,7 @@ class StructureSearch:
 
     def _prune(self, state: DiscoverState) -> DiscoverState:
         """The best structure without one of its extensions, from where it ended itself."""
-        best = max(state.fitted, key=rank)
+        best = max(self._counted(state), key=rank)
         for left_out in best.labels:
             labels = tuple(label for label in best.labels if label != left_out)
             if labels not in state.pruned and labels not in state.failed:
@@ -313,7 +316,7 @@ class StructureSearch:
                 before, failed = state.of(labels), state.failed
                 state = self._fitted(state, labels, best.theta[keep])
                 if before is not None:  # a failure says nothing then
-                    state = replace(state, fitted=_merged(state.fitted, before), failed=failed)
+                    state = replace(state, fitted=_merged(state.fitted, before), failed=failed, cut_off=None)
                 return replace(state, pruned=(*state.pruned, labels))
         return replace(state, phase=Phase.DONE)
 

@@ -19,7 +19,7 @@ BUDGET = 30_000  # rollouts by default: structures with two pieces of a machine 
 class DiscoverOptions(Options):
     """How structures are searched."""
 
-    width: int = option(3, "candidates that are fitted in a round; in the first twice as many", least=1)
+    width: int = option(3, "candidates that are fitted in a round; in the first up to twice as many", least=1)
     beam: int = option(2, "structures that each round extends", least=1)
     most: int = option(5, "extensions that a structure may have", least=1)
     least_gain: float = option(5.0, "predicted gain from which an extension is fitted", "nats", above=0)
@@ -29,7 +29,9 @@ class DiscoverOptions(Options):
     column_budget: int = option(400, "rollouts of one fit with another sign or unit", least=1)
     plain_share: float = option(0.5, "of the budget, for the model as it is at most", above=0, below=1)
     fit_budget: int = option(2000, "rollouts of one fit, or forty steps of it if that is more", least=1)
-    physics_steps: int = option(10000, "of the logs that are searched on, in blocks spread over longer ones", least=1)
+    physics_steps: int = option(
+        10000, "of the logs that are searched on at most, in blocks; fewer where parameters are many", least=1
+    )
 
 
 class Phase(enum.Enum):

@@ -105,10 +105,12 @@ def test_readme_is_short() -> None:
     assert not [line for line in lines if len(line) > 120]
 
 
-@pytest.mark.parametrize("name", ["simple_pendulum", "furuta_pendulum"])
-def test_examples_print_what_the_study_found(name: str) -> None:
-    """Of examples/studies/discover_real.py: what, by how much, and the error on each held-out log before and after."""
-    found = json.loads((ROOT / "examples" / "studies" / "results" / "discover_real.json").read_text())[name]
+STUDY = ROOT / "examples" / "studies" / "results" / "discover_real.json"
+
+
+@pytest.mark.parametrize(("name", "found"), json.loads(STUDY.read_text(encoding="utf-8")).items())
+def test_examples_print_what_the_study_found(name: str, found: dict[str, Any]) -> None:
+    """What, by how much, and the error on each held-out log before and after."""
     page = " ".join((ROOT / "examples" / name / "README.md").read_text(encoding="utf-8").split())
     errors = [f"{row['before']:.4f} to {row['after']:.4f}" for row in found["held-out errors"]]
     expected = [*found["found"], f"{found['gain']:.0f} ± {found['error']:.0f} nats", *errors]

@@ -107,6 +107,16 @@ def test_the_evidence_of_a_linear_structure_is_exact(parameters: list[Parameter]
     assert got == pytest.approx(expected, abs=0.02)
 
 
+def test_a_gain_that_was_not_taken_does_not_count() -> None:
+    """Of a linear model: half the move times the precision, which slopes promise where the search has not ended."""
+    windows = bound([OFFSET], 0.0)
+    ends, noise = at_optimum(windows, 0.0), Noise(np.array([SD]), np.zeros(1))
+    prior = QuadraticPrior.of(default_prior(windows.simulator.space))
+    early = scores(windows, np.full(1, 0.4), windows.no_starts(), noise, prior)
+    print(ends.evidence, early.evidence)
+    assert early.evidence < ends.evidence - 100
+
+
 @pytest.mark.parametrize("logs", [1, 2])
 def test_held_out_pieces_are_foretold_as_by_refitting(logs: int) -> None:
     """White noise, so that no sample is tied to one across a piece's edge; each window is a piece."""

@@ -17,7 +17,7 @@ class SolverTuning(Options):
     """How segments are fitted; see ``solver``."""
 
     damping: ClassVar[float] = 1e-3  # of the first step: nearly Gauss and Newton's
-    plain_gain: ClassVar[float] = 0.5  # the same of the plain fit
+    plain_gain: ClassVar[float] = 0.5  # nats a parameter, gain of a step below which the plain fit has converged
     most_steps: ClassVar[int] = 60  # from one starting point
     most_points: ClassVar[int] = 6  # with those found on the way
     growth: ClassVar[float] = 1.5  # by which beginnings of segments that meet impacts grow
@@ -29,7 +29,7 @@ class SolverTuning(Options):
     linearised_steps: float = option(5e5, "physics steps of a linearisation, until the fit has nearly converged")
     whole: float = option(4.0, "times as many at the end, at most: more segments are left out", least=1)
     compares: bool = option(
-        True, "whether plain least squares takes over where coloured noise explains what it should not"
+        True, "whether plain least squares takes over where coloured noise explains too much; else ends earlier"
     )
 
     @property
@@ -49,7 +49,7 @@ class LaplaceTuning(Options):
 
 
 EVIDENCE_TUNING = LaplaceTuning(
-    solver=SolverTuning(compares=False, linearised_steps=1e5), importance=ImportanceTuning(wanted=False)
+    solver=SolverTuning(compares=False, linearised_steps=1e5, whole=1e3), importance=ImportanceTuning(wanted=False)
 )
 """Of fits whose evidences are compared: those of different noise do not compare."""
 

@@ -123,7 +123,9 @@ def ties(discovery: Discovery) -> Verdict | None:
             [x for x, label in zip(larger.sentences, larger.labels, strict=True) if label not in best.labels]
         )
         gain = with_error(-larger.behind, larger.behind_error)
-        texts.append(f"Adding {added} gains {gain} nats: less than two standard errors, so it is left out.")
+        clear = -larger.behind > 2 * larger.behind_error
+        why = "held-out logs are predicted worse with it" if clear else "less than two standard errors"
+        texts.append(f"Adding {added} gains {gain} nats: {why}, so it is left out.")
     return Verdict("fair", " ".join(texts)) if texts else None
 
 
