@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 import time
 from collections import deque
 from pathlib import Path
@@ -121,15 +122,14 @@ def lines_of(discovery: Discovery) -> list[str]:
     )
 
     of_columns = f" ({discovery.column_rollouts} for signs and units of columns)" if discovery.column_rollouts else ""
-    effort = singular(f"{len(discovery.rows)} structures fitted, {discovery.rollouts} rollouts{of_columns}")
-    effort += f", {discovery.seconds:.0f} s"
-    lines = [f"{discovery.name}, what the model lacks: {effort}"]
+    effort = f"{len(discovery.rows)} structures fitted, {discovery.rollouts} rollouts{of_columns}"
+    lines = [f"{discovery.name}, what the model lacks: {singular(effort)}, {discovery.seconds:.0f} s"]
     tried = [f"{'log predictive density in nats over the model as it was':60}{'gain':>18}{'weight':>9}"]
     for one in discovery.rows:
         cells = f"{with_error(one.gain, one.error):>18}{weight_text(one):>9}"
         text = structure_text(one)
-        text = text if len(text) <= _WIDTH else " + ".join(one.labels)  # cut off, several would read alike
-        tried.append(f"  {text:{_WIDTH}.{_WIDTH}}{cells}")
+        first, *rest = textwrap.wrap(text if len(text) <= _WIDTH else " + ".join(one.labels), _WIDTH)
+        tried.append("\n    ".join([f"  {first:{_WIDTH}}{cells}", *rest]))
     lines += _cut(tried, _TRIED)
     errors = [error for error in discovery.errors if error.use == "holdout"] or list(discovery.errors)
     lines += _cut([f"{error.use} {error_line(error)}" for error in errors], _ERRORS)

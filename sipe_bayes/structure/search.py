@@ -127,8 +127,8 @@ class StructureSearch:
 
     def _counted(self, state: DiscoverState) -> list[FittedStructure]:
         """Those fitted to the end that predict held-out logs not worse than the plain model by a standard error."""
-        plain, held = state.fitted[0], len(self.fitting.trajectories)
-        worse = [(gain := difference(plain, one, held)).nats > gain.error for one in state.fitted]
+        held = len(self.fitting.trajectories)
+        worse = [(gain := difference(state.fitted[0], one, held)).nats > gain.error for one in state.fitted]
         return [one for one, bad in zip(state.fitted, worse, strict=True) if one.labels != state.cut_off and not bad]
 
     def _contains(self, one: FittedStructure, other: FittedStructure) -> bool:

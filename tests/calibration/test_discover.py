@@ -142,7 +142,9 @@ def test_what_mjcf_has_no_element_for_travels_with_the_model_and_is_said(tmp_pat
     assert piece.label == "direction_friction:hinge"
     xml = (tmp_path / "out" / "discovered.xml").read_text(encoding="utf-8")
     assert "by sipe_bayes and not by MuJoCo itself; nearest element: joint frictionloss and damping" in xml
-    assert "MJCF has no element for direction-dependent friction at hinge" in (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert "MJCF has no element for direction-dependent friction at hinge" in (
+        tmp_path / "out" / "report.html"
+    ).read_text("utf-8")
     problem = sipe.prepare(tmp_path / "out" / "discovered.toml", 1)
     space, actions = problem.simulator.space, problem.train.actions
     assert found.best["hinge.direction_friction"] == pytest.approx(FRICTION, rel=0.1)
