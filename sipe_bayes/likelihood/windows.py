@@ -51,7 +51,7 @@ from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.simulation.tangents import moved
 
 _BY_SAMPLE = ("owned", "compared", "measured", "observed")  # what a part of the windows has a part of
-_BY_WINDOW = ("number", "log", "start", "stride", "lead", "begin", "steps", "dt", "actions", "reference", *_BY_SAMPLE)
+_BY_WINDOW = ("number", "log", "start", "stride", "lead", "begin", "left", "steps", "dt", "actions", "reference")
 _SHORTER = (1.0, 0.5, 0.2, 0.05)  # steps of the starts that are tried, the next where one led uphill
 _SETTLED = 1e-3  # of the sum of squares: a step of the starts that gained less was the last
 _ITERATIONS = 2  # in which starts are looked for, near the measured ones
@@ -138,11 +138,13 @@ class Windows:
     def _read_samples(self, trajectories: Trajectories, like: Windows | None) -> None:
         simulator, environment = self.simulator, self.simulator.environment
         known = self.settings.starts == "recorded"
-        late = np.array([dict(self.settings.late).get(name, 0.0) for name in self.fitted])
-        late = np.maximum(late, environment.remembers[self.channels])
-        *reach, left = reached(late, self.dt, self.log, self.start, self.stride)
-        self.lead, self.begin = reach if like is None else (like.lead, like.begin)
-        self.steps = np.minimum(self.stride + self.lead.max(1), left)
+        late = [dict(self.settings.late).get(name, 0.0) for name in self.fitted]
+        own = reached(
+            np.maximum(late, environment.remembers[self.channels]), self.dt, self.log, self.start, self.stride
+        )
+        self.lead, self.begin = own[:2] if like is None else (like.lead, like.begin)
+        self.left: IntArray = own[2] if like is None else like.left
+        self.steps, left = np.minimum(self.stride + self.lead.max(1), self.left), self.left
         place = np.arange(int(self.steps.max()) + 1)
         sample = self.start[:, None] + place
         none = np.zeros((len(left), 1), np.int64)
@@ -284,7 +286,7 @@ class Windows:
     def part(self, keep: IntArray, observed: BoolArray | None = None) -> Windows:
         """Some of the windows, and samples (K, L, C) of theirs."""
         view = copy.copy(self)
-        for name in _BY_WINDOW:
+        for name in (*_BY_WINDOW, *_BY_SAMPLE):
             setattr(view, name, getattr(self, name)[keep])
         view.goals = None if self.goals is None else self.goals[keep]
         view.names = [self.names[w] for w in keep]

@@ -33,6 +33,16 @@ MISSING = {
 }
 
 
+def test_a_part_of_windows_that_come_late_is_probed_on_its_own_samples() -> None:
+    """As of long logs that are searched: a sample more or less would raise."""
+    simulator, settings = pendulum(), Segments(0.5, late=(("joint:hinge.position", 0.1),))
+    windows = Windows(settings, simulator, Trajectories.stack([log(simulator, [0.6, 0.08], 2)]))
+    part = windows.part(np.array([1, 3]))
+    like = Windows(settings, simulator, windows.trajectories, part)
+    assert part.steps.tolist() == like.steps.tolist() == [60, 60]
+    assert (part.observed == like.observed).all()
+
+
 @pytest.mark.parametrize("cause", MISSING)
 def test_what_is_missing_beside_a_delay_is_named_and_the_delay_held(cause: str) -> None:
     """The delay alone takes most of it on, and lies by as much; its interval with what is missing reaches the truth."""
