@@ -136,18 +136,16 @@ class Windows:
         self.names = [(trajectories.names or [None] * len(trajectories))[k] for k in self.log]
 
     def _read_samples(self, trajectories: Trajectories, like: Windows | None) -> None:
-        simulator, environment = self.simulator, self.simulator.environment
-        known = self.settings.starts == "recorded"
-        late = [dict(self.settings.late).get(name, 0.0) for name in self.fitted]
-        own = reached(
-            np.maximum(late, environment.remembers[self.channels]), self.dt, self.log, self.start, self.stride
-        )
+        simulator, known = self.simulator, self.settings.starts == "recorded"
+        environment = simulator.environment
+        named = [dict(self.settings.late).get(name, 0.0) for name in self.fitted]
+        late = np.maximum(named, environment.remembers[self.channels])
+        own = reached(late, self.dt, self.log, self.start, self.stride)
         self.lead, self.begin = own[:2] if like is None else (like.lead, like.begin)
         self.left: IntArray = own[2] if like is None else like.left
         self.steps, left = np.minimum(self.stride + self.lead.max(1), self.left), self.left
         place = np.arange(int(self.steps.max()) + 1)
-        sample = self.start[:, None] + place
-        none = np.zeros((len(left), 1), np.int64)
+        sample, none = self.start[:, None] + place, np.zeros((len(left), 1), np.int64)
         self.owned = compared_samples(place, self.stride, left, none, none, known)[..., 0]
         self.compared = compared_samples(place, self.stride, left, self.begin, self.lead, known)
         clipped = np.minimum(sample, trajectories.length[self.log][:, None])
