@@ -164,7 +164,7 @@ class SensorFilter(Extension):
         return f"a low-pass filter of {site}"
 
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
-        """Up to a tenth of a second, or twenty samples."""
+        """Up to a twentieth of a second, or twenty samples."""
         return (
             Parameter(
                 f"{site}.filter",
