@@ -24,7 +24,6 @@ from sipe_bayes.core.files import LineError, is_file, is_folder
 from sipe_bayes.core.units import find_unit
 from sipe_bayes.core.validation import MOST_ROLLOUTS, nearest_name
 from sipe_bayes.inference.registry import ESTIMATORS
-from sipe_bayes.structure.physics_step import PhysicsStep
 from sipe_bayes.structure.registry import EXTENSIONS
 
 _LISTED = 30  # words in a line
@@ -96,7 +95,7 @@ def _estimator(name: str) -> str:
 
 
 def _extension(name: str) -> str:
-    if name not in (*EXTENSIONS, PhysicsStep.name):
+    if name not in EXTENSIONS:
         hint = nearest_name(name, EXTENSIONS).removeprefix("; ") or f"known are {', '.join(EXTENSIONS)}"
         raise problem(f"no extension {name!r}; {hint}; one of your own goes into `extra`")
     return name

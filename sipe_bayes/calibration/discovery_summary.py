@@ -205,7 +205,7 @@ class _Model:
             asked = self.extensions
             placed = None if asked is None else place_extensions(windows, one.theta, one.starts, asked)
             at = one.theta, one.noise, one.starts, prior
-            logs = AugmentedModel(windows, *at, tell=self.tell, placed=placed, shorter=asked is None)
+            logs = AugmentedModel(windows, *at, tell=self.tell, placed=placed)
             return find_discrepancy(logs, self.problem.tolerances)
         except ValueError:  # LinAlgError is one
             return None

@@ -117,7 +117,6 @@ class AugmentedModel:
         tell: called with what is being done.
         kept: keeps what extensions do.
         placed: extensions that are probed; default all that the registry has.
-        shorter: whether a shorter physics step is asked as well.
 
     Raises:
         ValueError: where the simulation diverges at theta.
@@ -134,7 +133,6 @@ class AugmentedModel:
         tell: Tell = silent,
         kept: Kept = NOTHING_KEPT,
         placed: Sequence[Placed] | None = None,
-        shorter: bool = True,
     ) -> None:
         if placed is None:
             placed = place_extensions(windows, theta, windows.no_starts() if starts is None else starts)
@@ -150,7 +148,7 @@ class AugmentedModel:
         if not linearisation.valid:
             raise ValueError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
         try:
-            made = probes(windows, theta, starts, placed, shorter, tell, kept)
+            made = probes(windows, theta, starts, placed, tell, kept)
         finally:
             whole.rollouts = windows.rollouts
         self.probes, self.one_sided, self.effects = made.named, made.one_sided, made.effects

@@ -14,7 +14,6 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.structure.augmented import AugmentedModel
 from sipe_bayes.structure.extension import Placed
-from sipe_bayes.structure.physics_step import PHYSICS_STEP
 from sipe_bayes.structure.probes import Effect, bounds
 
 _SHAPED = 0.1  # of a parameter's range: a probe that goes further gives a shape, not a size
@@ -47,15 +46,6 @@ def rank_candidates(logs: AugmentedModel) -> list[Candidate]:
         if label not in ranked or candidate.gain > ranked[label].gain:
             ranked[label] = candidate
     return sorted(ranked.values(), key=lambda candidate: -candidate.gain)
-
-
-def gain_of_steps(logs: AugmentedModel) -> float:
-    """Log-likelihood in nats that integration steps which are shorter are to gain; at least none."""
-    steps = [k for k, probe in enumerate(logs.probes) if probe.extension is PHYSICS_STEP]
-    if not steps:
-        return 0.0
-    plain, with_them = logs.fitted(np.zeros(0, int)), logs.fitted(np.array(steps))
-    return logs.share * max(with_them.level - plain.level, 0.0) if with_them.sizes[0] > 0 else 0.0
 
 
 def _candidate(logs: AugmentedModel, effect: Effect, columns: IntArray, plain: float) -> Candidate:

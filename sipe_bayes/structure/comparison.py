@@ -21,7 +21,7 @@ log of the weighted mixture (Y. Yao, A. Vehtari, D. Simpson, A. Gelman 2018, htt
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -68,16 +68,11 @@ def difference(one: FittedStructure, other: FittedStructure, since: int = 0) -> 
     return Difference(total, float(np.sqrt(square * (1 + alike) / (1 - alike))))
 
 
-def choose_ties(
-    structures: Sequence[FittedStructure], contains: Callable[[FittedStructure, FittedStructure], bool]
-) -> list[FittedStructure]:
-    """The structures within two standard errors of the best one, without those of which a part is a tie as well.
-
-    contains: whether the first one contains the second one, and more.
-    """
+def choose_ties(structures: Sequence[FittedStructure]) -> list[FittedStructure]:
+    """The structures within two standard errors of the best one, without those of which a part is a tie as well."""
     best = max(structures, key=rank)
     ties = [one for one in structures if one is best or not difference(best, one).clear]
-    return [one for one in ties if not any(contains(one, other) for other in ties)]
+    return [one for one in ties if not any(set(other.labels) < set(one.labels) for other in ties)]
 
 
 def stack(structures: Sequence[FittedStructure]) -> FloatArray:

@@ -23,7 +23,6 @@ from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import placements
 from sipe_bayes.structure.fitted import Fitting
 from sipe_bayes.structure.machine import machine_of
-from sipe_bayes.structure.physics_step import PhysicsStep
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
 from sipe_bayes.structure.search import StructureSearch
 from sipe_bayes.structure.state import BUDGET, DiscoverOptions, DiscoverState, Phase
@@ -54,7 +53,7 @@ class Restriction:
 
     def __post_init__(self) -> None:
         for name in self.without:
-            if name not in (*EXTENSIONS, PhysicsStep.name):
+            if name not in EXTENSIONS:
                 hint = nearest_name(name, EXTENSIONS) or f"; known are {', '.join(EXTENSIONS)}"
                 raise ValueError(f"structure.without: no extension {name!r}{hint}")
 
@@ -63,13 +62,7 @@ class Restriction:
         """Those that may be tried."""
         usual = [name for name in EXTENSIONS if not get_extension(name).by_name]
         chosen = [*(usual if self.only is None else self.only), *self.extra]
-        return [name for name in dict.fromkeys(chosen) if name not in (*self.without, PhysicsStep.name)]
-
-    @property
-    def finer(self) -> bool:
-        """Whether shorter physics steps may be tried."""
-        chosen = self.only is None or PhysicsStep.name in self.only
-        return chosen and PhysicsStep.name not in self.without
+        return [name for name in dict.fromkeys(chosen) if name not in self.without]
 
     @property
     def digests(self) -> dict[str, str]:
@@ -216,7 +209,7 @@ def _search(
     if fitting.windows(simulator).impacts:
         fitting = _between_contacts(fitting, simulator)
     most = whole("budget", budget, 1, "rollouts", MOST_ROLLOUTS)
-    return StructureSearch(fitting, extensions, restriction.sites, options, most, progress, restriction.finer)
+    return StructureSearch(fitting, extensions, restriction.sites, options, most, progress)
 
 
 def _between_contacts(fitting: Fitting, simulator: Simulator) -> Fitting:

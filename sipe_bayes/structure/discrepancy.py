@@ -47,7 +47,7 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.likelihood import UNIFORM_PRECISION, BoundLikelihood, Noise
 from sipe_bayes.posterior import GaussianMixture, Particles, Posterior
 from sipe_bayes.structure.augmented import AtNoise, AugmentedModel
-from sipe_bayes.structure.physics_step import PHYSICS_STEP
+from sipe_bayes.structure.extensions.physics_step import PhysicsStep
 from sipe_bayes.structure.probes import Probe
 from sipe_bayes.structure.single_effects import EFFECTS, Columns, Effects, find_effects
 from sipe_bayes.structure.tolerances import EXACT, Tolerances
@@ -103,7 +103,7 @@ class Discrepancy:
         sizes = single + every
         known = self.known.draws(sizes, random)
         if not self.is_doubted:
-            steps = np.array([probe.extension is PHYSICS_STEP for probe in logs.probes], bool)
+            steps = np.array([isinstance(probe.extension, PhysicsStep) for probe in logs.probes], bool)
             known[:, ~asked(self.at) & ~steps] = 0.0
         sizes += known
         share = np.maximum(1 + DISCREPANCY.reach * random.standard_normal((count, 1)), 0.0)
@@ -269,7 +269,8 @@ def _effects(at: AtNoise, sds: FloatArray) -> tuple[IntArray, Effects | None]:
     """The probes that may be missing, and what is told of them beside numbers of known sds (K,)."""
     probes, made = at.logs.probes, at.projected
     able = [
-        not probe.by_log and not (probe.extension is PHYSICS_STEP and sd) for probe, sd in zip(probes, sds, strict=True)
+        not probe.by_log and not (isinstance(probe.extension, PhysicsStep) and sd)
+        for probe, sd in zip(probes, sds, strict=True)
     ]
     usable = np.flatnonzero(asked(at) & np.array(able, bool))
     known = Known.of(at, sds)

@@ -57,6 +57,7 @@ class Extension(ABC):
     native: bool = True  # MJCF has an element for it
     nearest: str = ""  # the element of MJCF that comes nearest, where it has none of its own
     by_name: bool = False  # tried only where it is named
+    fixed: bool = False  # nothing about it is unknown: it has no parameters
 
     @abstractmethod
     def sentence(self, site: str) -> str:
@@ -186,11 +187,10 @@ def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
     for site in (*sites[extension.kind], *_together(extension, sites[extension.kind], machine)):
         try:
             parameters = tuple(_with_own(machine, p) for p in extension.parameters(machine, site))
-            if not parameters or any(t in taken for p in parameters for t in p.targets):
+            if not (parameters or extension.fixed) or any(t in taken for p in parameters for t in p.targets):
                 continue
-            draft = Placed(
-                extension, site, parameters, extension.edit(machine, site), np.zeros((0, 0, len(parameters)))
-            )
+            edit = extension.edit(machine, site)
+            draft = Placed(extension, site, parameters, edit, np.zeros((0, 0, len(parameters))))
             _ = draft.sentence
         except Exception as error:  # the user's own code may raise anything
             raise _failed(extension, site, error) from error

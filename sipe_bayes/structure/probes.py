@@ -24,10 +24,9 @@ from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood import BoundLikelihood
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.extension import WORLD, Extension, Placed, extended, imitating, members, placements
+from sipe_bayes.structure.extension import Extension, Placed, extended, imitating, members, placements
 from sipe_bayes.structure.internal_starts import carried_starts, mapped_starts
 from sipe_bayes.structure.machine import machine_of
-from sipe_bayes.structure.physics_step import PHYSICS_STEP, RUNS, StepError, step_error
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
 
 _ROWS = 32  # simulated at once: all the states of a batch are in memory
@@ -107,8 +106,7 @@ def probes_cost(windows: BoundLikelihood, placed: Sequence[Placed]) -> int:
     """Rollouts that ``probes`` takes, but for extensions that do not go together; at this theta at most."""
     groups = _groups(placed)
     each = (1 + sum(one.probes.shape[0] * one.probes.shape[1] for one in group) for group in groups)
-    runs = RUNS * isinstance(windows.simulator.environment, MjcfEnvironment)
-    return (sum(each) + runs) * len(windows.trajectories)
+    return sum(each) * len(windows.trajectories)
 
 
 def probes(
@@ -116,18 +114,16 @@ def probes(
     theta: FloatArray,
     starts: FloatArray,
     placed: Sequence[Placed],
-    shorter: bool = True,
     tell: Tell = silent,
     kept: Kept = NOTHING_KEPT,
 ) -> Probes:
-    """Probes of extensions, and of a shorter physics step; none where the environment is no user's MJCF.
+    """Probes of extensions; none where the environment is no user's MJCF.
 
     Args:
         windows: the logs, W windows of L samples and C channels.
         theta: (N,) where the model stands.
         starts: (W, D) of the windows.
         placed: the extensions.
-        shorter: whether a shorter physics step is asked as well.
         tell: called with what is being done.
         kept: keeps what extensions do, group by group.
     """
@@ -137,26 +133,7 @@ def probes(
     named = [probe for effect in seen for probe in _named(effect)]
     one_sided = [bounds(effect.placed.plain, effect.probes)[0] >= 0 for effect in seen]
     changes = [np.zeros((*windows.observed.shape, 0)), *(_unit(effect.change) for effect in seen)]
-    if shorter and (error := _step_error(windows, theta, starts, tell, kept)) is not None:
-        change = error.change[..., None]
-        whole = float(_size(change)[0])
-        named.append(Probe(PHYSICS_STEP.sentence(WORLD), error.remedy, False, WORLD, PHYSICS_STEP, whole))
-        changes.append(_unit(change))
-        one_sided.append(np.ones(1, bool))
     return Probes(named, np.concatenate(changes, axis=-1), np.concatenate([np.zeros(0, bool), *one_sided]), seen)
-
-
-def _step_error(
-    windows: BoundLikelihood, theta: FloatArray, starts: FloatArray, tell: Tell, kept: Kept
-) -> StepError | None:
-    """What physics steps do to the predictions."""
-
-    def made(kept: Kept) -> tuple[StepError, ...]:
-        error = step_error(windows, theta, starts)
-        return () if error is None else (error,)
-
-    tell("simulating shorter physics steps")
-    return next(iter(kept.of("physics-step", tuple[StepError, ...], made)), None)
 
 
 def place_extensions(
@@ -197,6 +174,8 @@ def _named(effect: Effect) -> list[Probe]:
     if effect.trades.any():
         sized = effect.trades / np.sqrt(size)[:, None]
         return [replace(one, trade=tuple(row)) for one, row in zip(named, sized.tolist(), strict=True)]
+    if not placed.parameters:
+        return [replace(one, whole=own) for one, own in zip(named, size.tolist(), strict=True)]
     if not placed.wholes:
         return named
     ranges = np.array([parameter.high - parameter.low for parameter in placed.parameters])
@@ -205,7 +184,12 @@ def _named(effect: Effect) -> list[Probe]:
 
 
 def bounds(plain: FloatArray, tried: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How far probes (K, P) can be followed from the plain model (P,) within the cube, backwards and forwards: (K,)."""
+    """How far probes (K, P) can be followed from the plain model (P,) within the cube, backwards and forwards: (K,).
+
+    Where there are no parameters an extension is there or not.
+    """
+    if not len(plain):
+        return np.zeros(len(tried)), np.ones(len(tried))
     direction = tried - plain
     with np.errstate(divide="ignore", invalid="ignore"):
         up = np.where(direction > 0, (1 - plain) / direction, np.where(direction < 0, -plain / direction, np.inf))
@@ -289,26 +273,32 @@ def _simulated(
     """Effects of extensions that the simulator's model has."""
     bound = BoundLikelihood(windows.settings, simulator, windows.trajectories, windows)
     bound.budget, bound.deadline = windows.budget - windows.rollouts, windows.deadline
+    before, after = windows.simulator.model, simulator.model
+    if (before.nq, before.nv, before.na) == (after.nq, after.nv, after.na):  # whatever history of commands it has
+        own = 1 + before.nq + before.nv + before.na
+        bound.reference[:, :own] = windows.reference[:, :own]
     plain = np.concatenate([theta, *(one.plain for one in group)])
     rows, first = [plain], len(theta)
     tried = [_traded(windows.simulator.space, theta, one) for one in group]
     for probes, trade in tried:
-        for probe in probes.reshape(-1, probes.shape[-1]):
+        for probe in (probe for shape in probes for probe in shape):
             row = plain.copy()
             row[: len(theta)] += trade
             row[first : first + len(probe)] = probe
             rows.append(row)
         first += probes.shape[-1]
-    mapped = mapped_starts(windows.simulator.model, simulator.model, starts)
+    mapped = mapped_starts(before, after, starts)
     pieces = np.array_split(np.stack(rows), math.ceil(len(rows) / _ROWS))
     runs = []
     try:
         for piece in pieces:
-            begun = carried_starts(windows.simulator.model, bound, piece, np.tile(mapped, (len(piece), 1, 1)))
+            begun = carried_starts(before, bound, piece, np.tile(mapped, (len(piece), 1, 1)))
             runs.append(bound.predict(piece, begun))
     finally:
         windows.rollouts += bound.rollouts
     predicted, valid = (np.concatenate(parts) for parts in zip(*runs, strict=True))
+    if any(one.extension.fixed for one in group):  # which have no values at which they are the plain model
+        predicted[:1], valid[:1] = windows.predict(theta[None], starts[None])
     out, at = [], 1
     for one, (probes, trade) in zip(group, tried, strict=True):
         for shape in probes:

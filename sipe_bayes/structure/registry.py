@@ -38,6 +38,7 @@ _CLASSES = {  # name: module and class
     "base_compliance": "elastic:BaseCompliance",
     "supply_sag": "world:SupplySag",
     "medium_drag": "world:MediumDrag",
+    "physics_step": "physics_step:PhysicsStep",
     "residual": "world:Residual",
 }
 EXTENSIONS = (*ROWS, *_CLASSES)

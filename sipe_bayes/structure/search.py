@@ -6,7 +6,7 @@ r"""The search over structures: what fits best is extended, round by round; then
       v
     COLUMNS where much is left: signs and units of the logs' columns
       v
-    RANK    score tests of all extensions, shorter integration steps among them, beside each structure of the beam
+    RANK    score tests of all extensions, beside each structure of the beam
       |  something has a predicted gain        nothing has
       v                                           v
     FIT     the best few, one a step           PRUNE   each extension of the best structure left out once
@@ -33,13 +33,12 @@ from sipe_bayes.core.budget import BudgetExhausted, BudgetTooSmall, Deadline
 from sipe_bayes.inference.recorded import Progress, Tell
 from sipe_bayes.likelihood import QuadraticPrior
 from sipe_bayes.structure.augmented import AugmentedModel
-from sipe_bayes.structure.candidates import Candidate, gain_of_steps, rank_candidates
+from sipe_bayes.structure.candidates import Candidate, rank_candidates
 from sipe_bayes.structure.columns import Column, channels_of, choices, is_explained, log_jacobian, moving, unexplained
 from sipe_bayes.structure.comparison import choose_ties, difference, rank
 from sipe_bayes.structure.extension import Extension, Placed, members, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
 from sipe_bayes.structure.machine import Machine, machine_of
-from sipe_bayes.structure.physics_step import StepLadder, shorter_steps
 from sipe_bayes.structure.state import BUDGET, DiscoverOptions, DiscoverState, Offer, Phase
 
 
@@ -53,7 +52,6 @@ class StructureSearch:
         options: of the search.
         budget: rollouts at most.
         progress: called along the way.
-        finer: whether shorter physics steps are tried beside the extensions.
     """
 
     def __init__(
@@ -64,22 +62,20 @@ class StructureSearch:
         options: DiscoverOptions | None = None,
         budget: int = BUDGET,
         progress: Progress | None = None,
-        finer: bool = False,
     ) -> None:
         self.given = self.fitting = fitting
-        self.extensions, self.joints, self.finer = tuple(extensions), joints, finer
+        self.extensions, self.joints = tuple(extensions), joints
         self.options, self.budget, self.progress = options or DiscoverOptions(), budget, progress
         self._rollouts, self._fit_rollouts, self._doing = 0, 0, ""  # before the present fit, of it, and what it is for
         self.ended = "budget"  # what ends a search that is cut short: that, "time", or "interrupted"
         self._machine: Machine | None = None
         self._placed: dict[str, Placed] = {}
-        self._ladder = StepLadder()
 
     def step(self, state: DiscoverState) -> DiscoverState:
         """One fit or one ranking further."""
         self.place(state)
         self._rollouts, self._fit_rollouts = state.rollouts, 0
-        self._doing = state.describe(len(self._ladder.pieces(self._placed)))
+        self._doing = state.describe(len(self._placed))
         self._tell("")
         over = state.rollouts >= self.budget or self.is_late
         if state.phase is not Phase.PLAIN and state.fitted and over:
@@ -123,19 +119,13 @@ class StructureSearch:
             native = all(self._placed[label].extension.native for label in one.labels)
             return len(one.labels), not native, -rank(one)[1]
 
-        return sorted(choose_ties(self._counted(state), self._contains), key=simple)
+        return sorted(choose_ties(self._counted(state)), key=simple)
 
     def _counted(self, state: DiscoverState) -> list[FittedStructure]:
         """Those fitted to the end that predict held-out logs not worse than the plain model by a standard error."""
         held = len(self.fitting.trajectories)
         worse = [(gain := difference(state.fitted[0], one, held)).nats > gain.error for one in state.fitted]
         return [one for one, bad in zip(state.fitted, worse, strict=True) if one.labels != state.cut_off and not bad]
-
-    def _contains(self, one: FittedStructure, other: FittedStructure) -> bool:
-        """Whether a structure has all of another one and more; shorter integration steps contain longer ones."""
-        less, more = (set(self._ladder.pieces(each.labels)) for each in (other, one))
-        finer = self._ladder.rung(other.labels) <= self._ladder.rung(one.labels)
-        return less <= more and finer and set(one.labels) != set(other.labels)
 
     def enough(self, labels: Sequence[str]) -> int:
         """Rollouts that the fit of a structure may have."""
@@ -158,8 +148,6 @@ class StructureSearch:
             every = (p for p in every if all(parameter.log is None for parameter in p.parameters))
         allowed = None if self.joints is None else set(self.joints)
         self._placed = {p.label: p for p in every if allowed is None or allowed.issuperset(members(p.site))}
-        steps = {p.label: p for p in shorter_steps(windows)} if self.finer else {}
-        self._ladder, self._placed = StepLadder(tuple(steps)), self._placed | steps
 
     def _plain(self, state: DiscoverState) -> DiscoverState:
         """The plain model, where it can be fitted at all."""
@@ -221,7 +209,7 @@ class StructureSearch:
     def _rank(self, state: DiscoverState) -> DiscoverState:
         """Predicted gains beside one structure of the beam; or which structures are to be fitted."""
         for labels in state.beam:
-            if labels not in state.ranked and len(self._ladder.pieces(labels)) < self.options.most:
+            if labels not in state.ranked and len(labels) < self.options.most:
                 here = state.of(labels)
                 assert here is not None
                 return self._ranked(state, here)
@@ -232,7 +220,7 @@ class StructureSearch:
         """The structures with the largest predicted gains, beside what their part gains already; no tried ones.
 
         Beside the model as it is, as many again with a quarter of the best one's: far from the truth these are
-        rough. Shorter integration steps always: what long ones do looks like a delay, a filter or a spring.
+        rough.
         """
         options, plain, queue = self.options, state.fitted[0], dict[frozenset[str], tuple[float, tuple[str, ...]]]()
         for labels in state.beam:
@@ -240,21 +228,14 @@ class StructureSearch:
             before = 0.0 if here is None else rank(here)[1] - rank(plain)[1]
             own = {offer.label: offer for offer in state.offers if offer.at == labels}  # the last of each
             for offer in own.values():
-                grown = self._grown(offer)
+                grown = (*labels, offer.label)
                 if offer.gain > options.least_gain and not state.is_tried(grown):
                     queue.setdefault(frozenset(grown), (before + offer.gain, grown))
         ranked = sorted(queue.values(), key=lambda item: -item[0])
         best = ranked[0][0] if ranked else 0.0
         most = 2 * options.width if state.beam == ((),) else options.width
         close = [(gain, grown) for gain, grown in ranked[options.width : most] if gain >= best / 4]
-        chosen = [grown for _, grown in ranked[: options.width] + close]
-        steps = [grown for _, grown in ranked if grown[-1] in self._ladder.labels and grown not in chosen]
-        return (*chosen, *steps)
-
-    def _grown(self, offer: Offer) -> tuple[str, ...]:
-        """Labels of a structure with what was offered beside it; shorter steps take the place of longer ones."""
-        stepped = offer.label in self._ladder.labels
-        return (*(self._ladder.pieces(offer.at) if stepped else offer.at), offer.label)
+        return tuple(grown for _, grown in ranked[: options.width] + close)
 
     def _ranked(self, state: DiscoverState, here: FittedStructure) -> DiscoverState:
         """The state with predicted gains beside a structure, best first; cut where the budget ends."""
@@ -262,32 +243,27 @@ class StructureSearch:
         simulator = fitting.simulator(own)
         windows, prior = fitting.windows(simulator), QuadraticPrior.of(fitting.prior_of(simulator))
         taken = {*here.labels, *(t for p in own for q in p.parameters for t in q.targets)}
-        rest = [p for p in self._placed.values() if p.parameters]
-        rest = [p for p in rest if not taken & {p.label, *(t for q in p.parameters for t in q.targets)}]
-        windows.budget, ranked, cut, gain = max(self.budget - state.rollouts, 0), list[Candidate](), None, 0.0
+        every = self._placed.values()
+        rest = [p for p in every if not taken & {p.label, *(t for q in p.parameters for t in q.targets)}]
+        windows.budget, ranked, cut = max(self.budget - state.rollouts, 0), list[Candidate](), None
         windows.deadline = Deadline(fitting.ends)
-        finer = self._ladder.finer(here.labels)
         try:
-            if rest or finer is not None:
+            if rest:
                 at = here.theta, here.noise, here.starts, prior
                 tell: Tell = lambda what: self._tell(what, windows.rollouts)  # noqa: E731
-                logs = AugmentedModel(windows, *at, tell=tell, placed=rest, shorter=finer is not None)
-                ranked = rank_candidates(logs)
-                gain = 0.0 if finer is None else gain_of_steps(logs)
+                ranked = rank_candidates(AugmentedModel(windows, *at, tell=tell, placed=rest))
         except BudgetExhausted:
             cut = state.phase
         except ValueError:  # LinAlgError is one: of a structure that diverges nothing can be predicted
             ranked = []
         offers = tuple(Offer(here.labels, c.placed.label, c.gain, c.theta, c.others) for c in ranked)
         ranks = state.rank_rollouts + windows.rollouts
-        if finer is not None and gain > 0:
-            offers = (*offers, Offer(here.labels, finer[-1], gain, np.zeros(0), here.theta))
         done = (*state.ranked, here.labels) if cut is None else state.ranked
         return replace(state, offers=state.offers + offers, ranked=done, rank_rollouts=ranks, cut=cut)
 
     def _fit(self, state: DiscoverState) -> DiscoverState:
         labels, *rest = state.queue
-        offer = next(o for o in reversed(state.offers) if self._grown(o) == labels)
+        offer = next(o for o in reversed(state.offers) if (*o.at, o.label) == labels)
         state = self._fitted(state, labels, np.concatenate([offer.others, offer.theta]))
         if state.cut is not None:
             return state
@@ -302,7 +278,9 @@ class StructureSearch:
         best = max(state.fitted, key=rank)
         new = [one for one in state.fitted if one.labels not in state.ranked and not difference(best, one).clear]
         better = [
-            one for one in new if all(_is_better(one, part) for part in state.fitted if self._contains(one, part))
+            one
+            for one in new
+            if all(_is_better(one, part) for part in state.fitted if set(part.labels) < set(one.labels))
         ]
         return tuple(one.labels for one in sorted(better, key=rank, reverse=True)[: self.options.beam])
 

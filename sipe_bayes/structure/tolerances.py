@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from sipe_bayes.structure.physics_step import PHYSICS_STEP
+from sipe_bayes.structure.extensions.physics_step import PhysicsStep
 from sipe_bayes.structure.probes import Probe
 
 
@@ -36,8 +36,8 @@ class Tolerances:
         """The sd of the number that a probe changes."""
         if probe.extension is None:
             return 0.0
-        if probe.extension is PHYSICS_STEP:
-            return self.physics_step
+        if isinstance(probe.extension, PhysicsStep):
+            return self.physics_step * PhysicsStep.shorter / (PhysicsStep.shorter - 1)
         shares = {"body": self.geometry, "channel": self.timing, "actuator": self.commands.get(probe.site, 0.0)}
         return shares.get(probe.extension.kind, 0.0)
 

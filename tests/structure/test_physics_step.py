@@ -21,9 +21,12 @@ from sipe_bayes.posterior import Particles
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure import Restriction, Structures, discover
 from sipe_bayes.structure.augmented import AugmentedModel
-from sipe_bayes.structure.candidates import gain_of_steps
+from sipe_bayes.structure.candidates import rank_candidates
 from sipe_bayes.structure.discrepancy import find_discrepancy
-from sipe_bayes.structure.physics_step import PHYSICS_STEP, RUNS, StepLadder, shorter_steps, step_error
+from sipe_bayes.structure.extension import placements
+from sipe_bayes.structure.extensions.physics_step import PhysicsStep
+from sipe_bayes.structure.machine import machine_of
+from sipe_bayes.structure.probes import effects
 from sipe_bayes.structure.registry import EXTENSIONS
 from sipe_bayes.structure.tolerances import EXACT, Tolerances
 from tests.problems.pendulums import DT, log, pendulum, stepped
@@ -58,33 +61,34 @@ def pushed(simulator: Simulator, states: bool = False) -> Windows:
     return Windows(settings, simulator, Trajectories.stack([known]))
 
 
-def lead_since(begin: float) -> FloatArray:
-    """What lacks of it where steps of 5 ms are none."""
-    return -3.0 * np.maximum(0.0, 0.02 * np.arange(51) - begin) * 0.005 / 2
+def lead_since(begin: float, step: float = 0.005, dt: float = 0.02) -> FloatArray:
+    """What lacks of it where steps are an eighth as long."""
+    return -3.0 * np.maximum(0.0, dt * np.arange(51) - begin) * 7 / 8 * step / 2
+
+
+def change(windows: Windows, theta: FloatArray) -> FloatArray | None:
+    """Of the predictions (W, L, C); None where nothing can be said."""
+    own = list(placements(PhysicsStep(), machine_of(windows, theta, windows.no_starts())))
+    found = effects(windows, theta, windows.no_starts(), own)
+    return found[0].change[..., 0] if found else None
 
 
 def test_eulers_steps_lead_by_half_a_step() -> None:
     """x_n = a h^2 n (n + 1) / 2 where the machine has a t^2 / 2."""
-    windows = pushed(slide())
-    before = windows.rollouts
-    error = step_error(windows, np.array([0.5]), windows.no_starts())
-    assert error is not None
-    assert windows.rollouts - before == RUNS
-    assert error.timestep == 0.005
-    assert '"0.0025"' in error.remedy
-    np.testing.assert_allclose(error.change[0, :, 0], lead_since(0.2), atol=1e-12)
+    found = change(pushed(slide()), np.array([0.5]))
+    assert found is not None
+    np.testing.assert_allclose(found[0, :, 0], lead_since(0.2), atol=1e-12)
 
 
 def test_a_delay_of_the_models_own_stays_what_it_is() -> None:
     """Of 20 ms, whose history of commands is then twice as long; recorded states do not tell it."""
     late = slide(' delay="0.02" nsample="4" interp="linear"')
-    windows = pushed(late)
-    error = step_error(windows, np.array([0.5]), windows.no_starts())
-    assert error is not None
-    np.testing.assert_allclose(error.change[0, :, 0], lead_since(0.22), atol=1e-12)
+    found = change(pushed(late), np.array([0.5]))
+    assert found is not None
+    np.testing.assert_allclose(found[0, :, 0], lead_since(0.22), atol=1e-12)
     for simulator, asked in ((slide(), True), (late, False)):
         rows = pushed(simulator, states=True)
-        assert (step_error(rows, np.array([0.5]), rows.no_starts()) is not None) == asked
+        assert (change(rows, np.array([0.5])) is not None) == asked
 
 
 def fitted(step: float, seed: int) -> tuple[AugmentedModel, Particles, FloatArray]:
@@ -109,11 +113,11 @@ def test_each_log_has_the_error_of_its_own_steps() -> None:
         motion = simulator.rollout([[0.5]], actions[None], np.atleast_2d(simulator.default_state()), dt=dt)
         rows.append(Trajectory(motion.observations[0], actions, dt, None, f"{dt:g}"))
     windows = Windows(Segments(None), simulator, Trajectories.stack(rows))
-    error = step_error(windows, np.array([0.5]), windows.no_starts())
-    assert error is not None
-    assert error.timestep == 0.005
-    for change, dt, step in zip(error.change[..., 0], (0.02, 0.002), (0.005, 0.002), strict=True):
-        np.testing.assert_allclose(change, -3.0 * dt * np.arange(51) * step / 2, atol=1e-12)
+    found = change(windows, np.array([0.5]))
+    assert found is not None
+    np.testing.assert_allclose(found[0, :, 0], lead_since(0.0), atol=1e-12)
+    # of 2 ms and .667 ms: the longest that are shorter than .625 ms and divide a sample are .5 ms
+    np.testing.assert_allclose(found[1, :, 0], lead_since(0.0, 0.002, 0.002) / (7 / 8) * 3 / 4, atol=1e-12)
 
 
 def test_recorded_states_are_where_both_runs_begin() -> None:
@@ -126,10 +130,10 @@ def test_recorded_states_are_where_both_runs_begin() -> None:
     assert motion.states is not None
     known = Trajectory(begun.observations, begun.actions, DT, motion.states[0], "known")
     windows = Windows(Segments(0.5), simulator, Trajectories.stack([known]))
-    error = step_error(windows, simulator.space.normalise(np.array([0.6, 0.08, 0.02])), windows.no_starts())
-    assert error is not None
-    np.testing.assert_allclose(error.change[:, 0], 0.0, atol=1e-12)
-    assert np.abs(error.change).max() > 1e-4
+    found = change(windows, simulator.space.normalise(np.array([0.6, 0.08, 0.02])))
+    assert found is not None
+    np.testing.assert_allclose(found[:, 0], 0.0, atol=1e-12)
+    assert np.abs(found).max() > 1e-4
 
 
 @pytest.mark.parametrize(("step", "shows"), [(DT / 20, True), (DT, False)])
@@ -152,14 +156,13 @@ def test_a_step_of_which_the_logs_tell_is_not_untold() -> None:
     for seed in (1, 2, 3, 4):
         logs, *_ = fitted(DT, seed)
         assert untold(find_discrepancy(logs, ALLOWED)) == []
-        (k,) = (k for k, probe in enumerate(logs.probes) if probe.extension is PHYSICS_STEP)
+        (k,) = (k for k, probe in enumerate(logs.probes) if isinstance(probe.extension, PhysicsStep))
         signs.add(bool(logs.seen.projected.score[k] > 0))
     assert signs == {True, False}
 
 
-AMONG = ("delay", "lag", "sensor_delay", "dry_friction", "spring")
-FRICTION = Parameter("planted", 0.0, 0.5, targets=("joint:hinge.frictionloss",))
-STEPS = {"physics_step:2.5 ms", "physics_step:0.625 ms"}
+AMONG = ("physics_step", "delay", "lag", "sensor_delay", "dry_friction", "spring")
+STEPS = {"physics_step:world"}
 
 
 def among(recorded: Trajectory) -> Structures:
@@ -193,21 +196,17 @@ def test_what_steps_do_is_not_named_as_a_piece(steps: float, planted: str | None
         assert value == pytest.approx(size, rel=0.1)
 
 
-def placed(restriction: Restriction, simulator: Simulator, states: bool = False) -> set[str]:
-    """Labels of all that a search may try; states: whether windows begin at the log's own."""
-    theta = simulator.space.normalise(np.array([0.6, 0.08, 0.02][: len(simulator.space)]))
-    recorded = log(simulator, simulator.space.values(theta).tolist(), 3)
-    motion = simulator.rollout(theta, recorded.actions, simulator.default_state(), dt=DT)
-    assert motion.states is not None
-    logs = Trajectories.stack([Trajectory(recorded.observations, recorded.actions, DT, motion.states[0], "known")])
-    likelihood = Segments(None, starts="recorded" if states else "estimated")
-    return set(discover(simulator, logs, likelihood=likelihood, restriction=restriction, budget=400).search.placed)
+def placed(restriction: Restriction, simulator: Simulator) -> set[str]:
+    """Labels of all that a search may try."""
+    theta = simulator.space.normalise(np.array([0.6, 0.08]))
+    logs = Trajectories.stack([log(simulator, simulator.space.values(theta).tolist(), 3)])
+    return set(discover(simulator, logs, restriction=restriction, budget=400).search.placed)
 
 
 @pytest.mark.parametrize(
     ("restriction", "tried"),
     [
-        (Restriction(sites=("hinge",)), True),
+        (Restriction(sites=("hinge",)), False),
         (Restriction(only=("delay", "physics_step")), True),
         (Restriction(only=("delay", "spring")), False),
         (Restriction(without=("physics_step",)), False),
@@ -220,45 +219,19 @@ def test_steps_are_tried_unless_other_pieces_are_chosen_or_they_are_left_out(
     assert STEPS & placed(restriction, pendulum()) == (STEPS if tried else set())
 
 
-def test_steps_that_the_logs_do_not_go_with_are_not_tried() -> None:
-    """Recorded states with a history of commands, which shorter steps make longer."""
-    delay, few = Parameter("delay", 0.0, 0.1, targets=("actuator:motor.delay",)), Restriction(only=("physics_step",))
-    assert not placed(few, pendulum(delay), states=True)
-    assert placed(few, pendulum(), states=True) == STEPS
-
-
-def test_finer_steps_are_not_refused_by_a_tie_of_held_out_pieces() -> None:
-    """Of a quarter of a quarter, as a sensor that is late by half a step would explain the rest of a rough log."""
-    truth = pendulum(FRICTION, edits=[partial(stepped, seconds=1e-3)])
-    structures = among(log(truth, [0.6, 0.08, 0.03], 2, sd=0.002))
-    print(structures.table())
-    assert set(structures.best.labels) == {"dry_friction:hinge", "physics_step:0.625 ms"}
-    assert structures.inclusion().get("physics_step:2.5 ms", 0.0) < 0.1
-
-
-def test_a_structure_has_one_step_at_most() -> None:
-    ladder = StepLadder(("a", "b"))
-    assert ladder.finer(()) == ("a",)
-    assert ladder.finer(("friction", "a", "delay")) == ("friction", "delay", "b")
-    assert ladder.finer(("b", "friction")) is None
-    assert [ladder.rung(labels) for labels in ((), ("a",), ("friction", "b"))] == [0, 1, 2]
-    assert ladder.pieces(("friction", "b", "delay")) == ("friction", "delay")
-
-
 @pytest.mark.parametrize(("truth", "least", "most"), [(DT / 16, 30.0, 200.0), (DT, 0.0, 2.0)])
 def test_what_shorter_steps_promise_is_about_what_they_gain(truth: float, least: float, most: float) -> None:
     """At the optimum of a log in fine steps as much as the fit then gains; of one in the model's own steps nothing."""
     simulator, machine = pendulum(), pendulum(edits=[partial(stepped, seconds=truth)])
     fitting = among(log(machine, [0.6, 0.08], 2, sd=0.002)).search.fitting
     plain = fitting.fit([], None, 2000)
-    pieces = [p for p in shorter_steps(fitting.windows(simulator)) if p.label == "physics_step:2.5 ms"]
+    windows = fitting.windows(simulator)
+    pieces = list(placements(PhysicsStep(), machine_of(windows, plain.theta, plain.starts)))
     at = plain.theta, plain.noise, plain.starts, QuadraticPrior.of(fitting.prior)
-    gains = [
-        gain_of_steps(AugmentedModel(fitting.windows(simulator), *at, placed=[], shorter=asked))
-        for asked in (True, False)
-    ]
-    gain, one = gains[0], fitting.fit(pieces, plain.theta, 2000)
+    ((gain, one),) = (
+        (max(candidate.gain, 0.0), fitting.fit(pieces, plain.theta, 2000))
+        for candidate in rank_candidates(AugmentedModel(windows, *at, placed=pieces))
+    )
     print(gain, one.evidence - plain.evidence)
-    assert gains[1] == 0.0
     assert least <= gain < most
     assert 0.4 * gain - 1 < max(one.evidence - plain.evidence, 0.0) < 2.5 * gain + 1

@@ -25,7 +25,7 @@ from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.structure.augmented import AugmentedModel
 from sipe_bayes.structure.discover import FEWEST_APART
 from sipe_bayes.structure.discrepancy import Discrepancy, LogEstimate, draw_differing, find_discrepancy
-from sipe_bayes.structure.physics_step import PHYSICS_STEP
+from sipe_bayes.structure.extensions.physics_step import PhysicsStep
 
 _NAMED = 3  # numbers whose error the logs do not show
 
@@ -142,7 +142,7 @@ def untold(found: Discrepancy) -> list[Finding]:
         what = one.sentence[0].upper() + one.sentence[1:]
         said.append(f"{what} cannot be seen in these logs. It would bias {', '.join(moved)}.")
     for one in moving:
-        if one.probe.extension is not PHYSICS_STEP:  # the interval allows for steps
+        if not isinstance(one.probe.extension, PhysicsStep):  # the interval allows for steps
             hangs |= one.moves(sd)
     names = [space[j].name for j in np.flatnonzero(hangs).tolist()]
     return [finding(Code.UNTOLD, parameters=names, moved=" ".join(said))] if said else []

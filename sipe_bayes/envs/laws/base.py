@@ -76,7 +76,7 @@ class Law(ABC):
     """A force at a joint that MJCF has no element for.
 
     ``kind`` says what it is declared at; ``senses`` whether it needs the transmitted torque or the actuator's force. A
-    law gives a force or friction. Adding one takes a class and a line in ``registry.LAWS``.
+    law gives a force or friction. Adding one takes a class, and an extension that writes its numbers.
     """
 
     name: ClassVar[str]

@@ -1,29 +1,12 @@
-"""The only list of laws."""
+"""The laws by name, and by the target that writes one of their numbers: what each of these modules defines."""
 
 from __future__ import annotations
 
+from sipe_bayes.envs.laws import drive, friction, memory, residual
 from sipe_bayes.envs.laws.base import Law
-from sipe_bayes.envs.laws.drive import Cogging, DeadZone, DirectionGain, ForceDrop, Power, SupplySag
-from sipe_bayes.envs.laws.friction import DirectionDamping, DirectionFriction, LoadFriction, Stribeck
-from sipe_bayes.envs.laws.memory import Hysteresis, Presliding
-from sipe_bayes.envs.laws.residual import Residual
 
+_MODULES = (friction, memory, drive, residual)
 LAWS: dict[str, Law] = {
-    law.name: law
-    for law in (
-        LoadFriction(),
-        DirectionFriction(),
-        DirectionDamping(),
-        Stribeck(),
-        Presliding(),
-        Hysteresis(),
-        Cogging(),
-        ForceDrop(),
-        DirectionGain(),
-        Power(),
-        DeadZone(),
-        SupplySag(),
-        Residual(),
-    )
+    kind.name: kind() for kind in Law.__subclasses__() if kind.__module__ in {module.__name__ for module in _MODULES}
 }
 LAW_OF = {(law.kind, number.attribute): (law, k) for law in LAWS.values() for k, number in enumerate(law.numbers)}
