@@ -139,7 +139,7 @@ def _untried(structures: Structures) -> str:
         names = [" with ".join(search.placed[label].sentence for label in labels) for labels in state.queue]
     elif state.cut in (Phase.PLAIN, Phase.COLUMNS, Phase.RANK):
         there = structures.best.labels
-        names = [p.sentence for p in search.placed.values() if p.parameters and p.label not in there]
+        names = [p.sentence for p in search.placed.values() if p.label not in there]
     else:
         names = []
     if not names:

@@ -125,8 +125,7 @@ def test_sds_are_the_scatter_whether_samples_remember_or_not(memory: float) -> N
 
 
 def test_of_logs_without_extensions_only_what_differs_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sipe_bayes.structure.probes.EXTENSIONS", {})
-    monkeypatch.setattr("sipe_bayes.structure.probes.step_error", lambda *_: None)
+    monkeypatch.setattr("sipe_bayes.structure.probes.EXTENSIONS", ())
     logs, theta = linearised().windows, linearised().theta
     bare = AugmentedModel(logs, theta, Noise(np.array([SD]), np.zeros(1)))
     seen = find_discrepancy(bare)
