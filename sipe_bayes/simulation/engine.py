@@ -24,7 +24,7 @@ from sipe_bayes.simulation.short_delays import ShortDelays
 
 _TIME_TOLERANCE = 0.5  # of a physics step: a reset or a repeated sample is a whole one off
 _FORCES = int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-_SHORT, _PIECES = 32, 4  # of so few physics steps a thread takes few pieces: to fetch more costs more than it balances
+_SHORT, _LEAST = 32, 32  # up to so many steps each thread takes one piece, of as many simulated steps at least
 HUGE = float(mujoco.mjMAXVAL)  # beyond it MuJoCo takes a number for a diverged one
 
 
@@ -73,6 +73,7 @@ class Engine:
         self.environment, self.model, self.num_threads = environment, model, num_threads
         self.physics_size = int(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
         self._threads = mujoco.rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
+        self._alone = mujoco.rollout.Rollout(nthread=0)
         self._datas = [mujoco.MjData(model) for _ in range(num_threads)]
         self.laws = LawSteps(model, environment.control_spec)
         self.firmware = FirmwareSteps(model)
@@ -196,9 +197,12 @@ class Engine:
         batch, steps = controls.shape[:2]
         out = np.empty((batch, steps, self.physics_size))
         sensors = np.empty((batch, steps, self.model.nsensordata)) if reads else None
-        self._threads.rollout(
+        # to wake a thread takes as long as it simulates some thirty steps of a small machine
+        pieces = min(self.num_threads, batch * steps // _LEAST) if steps <= _SHORT else self.num_threads
+        threads, datas = (self._threads, self._datas) if pieces > 1 else (self._alone, self._datas[:1])
+        threads.rollout(
             models,
-            self._datas,
+            datas,
             np.ascontiguousarray(start),
             np.ascontiguousarray(controls),
             control_spec=spec,
@@ -206,7 +210,7 @@ class Engine:
             nstep=steps,
             state=out,
             sensordata=sensors,
-            chunk_size=math.ceil(batch / (_PIECES * self.num_threads)) if steps <= _SHORT else None,
+            chunk_size=math.ceil(batch / pieces) if pieces > 1 and steps <= _SHORT else None,
         )
         return out, np.empty((batch, steps, 0)) if sensors is None else sensors
 

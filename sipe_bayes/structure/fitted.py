@@ -22,10 +22,12 @@ from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.columns import Column, corrected
 from sipe_bayes.structure.extension import Placed, extended
-from sipe_bayes.structure.scores import Pieces, predictive, scores
+from sipe_bayes.structure.internal_starts import mapped_starts
+from sipe_bayes.structure.scores import Pieces, Scores, predictive, scores
 
 _STEPS = 40  # of a fit, which takes twenty to thirty
 _EDGE = 1e-3  # of the cube: at a bound
+_UNNEEDED = 10.0  # nats of evidence that extensions cost at most which explain nothing
 _FLAT_SD = 1e3  # of the cube: stands for a uniform prior beside a normal one
 
 
@@ -125,15 +127,23 @@ class Fitting:
         return beside(self.prior, simulator.space)
 
     def fit(
-        self, placed: Sequence[Placed], initial: FloatArray | None, budget: int, progress: Progress | None = None
+        self,
+        placed: Sequence[Placed],
+        initial: FloatArray | None,
+        budget: int,
+        progress: Progress | None = None,
+        part: FittedStructure | None = None,
     ) -> FittedStructure:
         """The best optimum of a structure, and its scores.
+
+        What fits worse than a part of it has ended at another optimum: then it is fitted again, from where that ended.
 
         Args:
             placed: its extensions.
             initial: (N + P,), where the search begins; default as ``laplace`` does.
             budget: rollouts at most.
             progress: called along the way.
+            part: a structure with some of these extensions; none by default.
 
         Raises:
             BudgetTooSmall: where it ends before there is an optimum.
@@ -143,8 +153,15 @@ class Fitting:
         windows = self.windows(simulator)
         left = max(budget - self._scoring(windows), 1)
         best, rollouts = self._optimum(simulator, prior, initial, left, progress)
-        assert best.starts is not None
-        evidence, pieces = scores(windows, best.theta, best.starts, best.noise, QuadraticPrior.of(prior))
+        evidence, pieces = self._scores(windows, best, prior)
+        if part is not None and evidence < part.evidence - _UNNEEDED and left > rollouts:
+            before = self.simulator([one for one in placed if one.label in part.labels])
+            starts = mapped_starts(before.model, simulator.model, part.starts)
+            other, more = self._optimum(simulator, prior, initial, left - rollouts, progress, starts)
+            rollouts += more
+            again = self._scores(windows, other, prior)
+            if again[0] > evidence:
+                best, (evidence, pieces) = other, again
         if self.holdout is not None:
             held = BoundLikelihood(self.likelihood, simulator, self.holdout)
             pull = np.linalg.solve(best.covariance, best.mean - best.theta)
@@ -161,12 +178,17 @@ class Fitting:
             best.covariance,
             best.noise.sd,
             best.noise.tau,
-            best.starts,
+            windows.no_starts() if best.starts is None else best.starts,
             evidence,
             pieces,
             rollouts + windows.rollouts,
             best.finding is None,
         )
+
+    @staticmethod
+    def _scores(windows: BoundLikelihood, best: FitResult, prior: Posterior) -> Scores:
+        assert best.starts is not None
+        return scores(windows, best.theta, best.starts, best.noise, QuadraticPrior.of(prior))
 
     def _scoring(self, windows: BoundLikelihood) -> int:
         """Rollouts that the scores of an optimum take."""
@@ -181,8 +203,9 @@ class Fitting:
         initial: FloatArray | None,
         budget: int,
         progress: Progress | None,
+        starts: FloatArray | None = None,
     ) -> tuple[FitResult, int]:
-        """The best optimum, and the rollouts that the fit took."""
+        """The best optimum, and the rollouts that the fit took; from starts (W, D) on where they are given."""
         given = None if initial is None else initial[None]
         laplace = Laplace(
             simulator,
@@ -194,6 +217,7 @@ class Fitting:
             initial=given,
             tuning=EVIDENCE_TUNING,
         )
+        laplace.initial_starts = starts
         laplace.time_limit = max(self.ends - time.monotonic(), 0.0)
         laplace.fit(self.trajectories)
         assert laplace.result is not None

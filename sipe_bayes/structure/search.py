@@ -268,10 +268,32 @@ class StructureSearch:
         if state.cut is not None:
             return state
         state = replace(state, queue=tuple(rest))
+        one, plain = state.of(labels), state.fitted[0]
+        if one and not offer.at and () not in state.pruned and one.evidence - plain.evidence > 2 * offer.gain:
+            return self._replaced(state, one)
         if rest:
             return state
         beam = self._next_beam(state)
         return replace(state, beam=beam, phase=Phase.RANK) if beam else replace(state, phase=Phase.PRUNE)
+
+    def _replaced(self, state: DiscoverState, one: FittedStructure) -> DiscoverState:
+        """The plain model from where a structure ended that gains far more than predicted: at a better optimum anew.
+
+        An extension can not gain more than the model is linear for, but where it led the search elsewhere.
+        """
+        before, state = state.fitted[0], self._without(state, one, ())
+        plain = state.fitted[0]
+        if state.cut is not None or plain.evidence < before.evidence + self.options.least_gain:
+            return state
+        spent = sum(other.rollouts for other in state.fitted[1:])
+        anew = DiscoverState(Phase.RANK, (plain,), columns=state.columns, pruned=((),), budget=state.budget)
+        return replace(
+            anew,
+            column_rollouts=state.column_rollouts,
+            rank_rollouts=state.rank_rollouts,
+            failed_rollouts=state.failed_rollouts + spent,
+            untried=state.untried,
+        )
 
     def _next_beam(self, state: DiscoverState) -> tuple[tuple[str, ...], ...]:
         """Labels of the best new structures that are clearly better than what they contain, and not clearly behind."""
@@ -290,13 +312,17 @@ class StructureSearch:
         for left_out in best.labels:
             labels = tuple(label for label in best.labels if label != left_out)
             if labels not in state.pruned and labels not in state.failed:
-                keep = [i for i, label in enumerate(self._owners(best)) if label in (None, *labels)]
-                before, failed = state.of(labels), state.failed
-                state = self._fitted(state, labels, best.theta[keep])
-                if before is not None:  # a failure says nothing then
-                    state = replace(state, fitted=_merged(state.fitted, before), failed=failed, cut_off=None)
-                return replace(state, pruned=(*state.pruned, labels))
+                return self._without(state, best, labels)
         return replace(state, phase=Phase.DONE)
+
+    def _without(self, state: DiscoverState, one: FittedStructure, labels: tuple[str, ...]) -> DiscoverState:
+        """With a structure that has only those ``labels`` of another one, fitted from where that one ended."""
+        keep = [i for i, label in enumerate(self._owners(one)) if label in (None, *labels)]
+        before, failed = state.of(labels), state.failed
+        state = self._fitted(state, labels, one.theta[keep])
+        if before is not None:  # a failure says nothing then
+            state = replace(state, fitted=_merged(state.fitted, before), failed=failed, cut_off=None)
+        return replace(state, pruned=(*state.pruned, labels))
 
     def _owners(self, one: FittedStructure) -> list[str | None]:
         """Whose each parameter of a structure is: None for the user's own."""
@@ -307,10 +333,12 @@ class StructureSearch:
     def _fitted(self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray) -> DiscoverState:
         left, cut = max(self.budget - state.rollouts, 0), None
         self._rollouts, self._fit_rollouts = state.rollouts, 0
+        parts = [other for other in state.fitted if set(other.labels) < set(labels)]
+        part = max(parts, key=lambda other: other.evidence, default=None)
         try:
             most = self.enough(labels)
             cut = state.phase if left < most else None
-            one = self.fitting.fit(self.structure(labels), initial, max(min(most, left), 1), self._tell)
+            one = self.fitting.fit(self.structure(labels), initial, max(min(most, left), 1), self._tell, part)
             cut = state.phase if self.is_late else cut
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
             spent = state.failed_rollouts + self._fit_rollouts

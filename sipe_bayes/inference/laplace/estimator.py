@@ -83,6 +83,8 @@ class Laplace(Estimator[LaplaceState]):
     options_type = LaplaceOptions
     state_type = LaplaceState
     options: LaplaceOptions
+    initial_starts: FloatArray | None = None
+    """(W, D) of segments, of the one starting point: the fit begins at both, with all segments."""
 
     def check_options(self) -> None:
         """Hold the starting points against the parameters, and into the cube."""
@@ -118,7 +120,14 @@ class Laplace(Estimator[LaplaceState]):
 
     def start(self, trajectories: Trajectories) -> LaplaceState:
         """The first state of the search that fits the likelihood."""
-        return LaplaceState(self._strategy(self.bound(trajectories)).start())
+        strategy = self._strategy(self.bound(trajectories))
+        begun = LaplaceState(strategy.start())
+        if self.initial_starts is None or self.options.initial is None:
+            return begun
+        assert isinstance(strategy, SegmentSolver)
+        assert isinstance(begun.search, WindowState)
+        onward = strategy.onward(begun.search, self.options.initial[0], self.initial_starts)
+        return begun if onward is None else LaplaceState(onward)
 
     def describe(self, state: LaplaceState) -> str:
         """Starting point and step, or draws."""
