@@ -270,7 +270,9 @@ class StructureSearch:
         state = replace(state, queue=tuple(rest))
         one, plain = state.of(labels), state.fitted[0]
         if one and not offer.at and () not in state.pruned and one.evidence - plain.evidence > 2 * offer.gain:
-            return self._replaced(state, one)
+            state = self._replaced(state, one)
+            if state.cut is not None or not state.ranked:
+                return state
         if rest:
             return state
         beam = self._next_beam(state)

@@ -169,8 +169,8 @@ def test_shorter_steps_are_written_into_the_model(tmp_path: Path) -> None:
     (piece,) = discovery.kept
     assert piece.label == "physics_step:world"
     assert not discovery.added
-    assert discovery_verdicts(discovery)[0].text.startswith("The logs support physics steps a quarter as long")
-    assert 'timestep="0.0025"' in (tmp_path / "out" / "discovered.xml").read_text(encoding="utf-8")
+    assert discovery_verdicts(discovery)[0].text.startswith("The logs support physics steps an eighth as long")
+    assert 'timestep="0.00125"' in (tmp_path / "out" / "discovered.xml").read_text(encoding="utf-8")
     again = run(tmp_path / "out" / "discovered.toml", out=tmp_path / "again", num_threads=1)
     assert {p.name: p.mode for p in again.parameters} == pytest.approx(dict(discovery.best), rel=1e-3)
 

@@ -62,8 +62,8 @@ def pushed(simulator: Simulator, states: bool = False) -> Windows:
 
 
 def lead_since(begin: float, step: float = 0.005, dt: float = 0.02) -> FloatArray:
-    """What lacks of it where steps are a quarter as long."""
-    return -3.0 * np.maximum(0.0, dt * np.arange(51) - begin) * 3 / 4 * step / 2
+    """What lacks of it where steps are an eighth as long."""
+    return -3.0 * np.maximum(0.0, dt * np.arange(51) - begin) * 7 / 8 * step / 2
 
 
 def change(windows: Windows, theta: FloatArray) -> FloatArray | None:
@@ -116,8 +116,8 @@ def test_each_log_has_the_error_of_its_own_steps() -> None:
     found = change(windows, np.array([0.5]))
     assert found is not None
     np.testing.assert_allclose(found[0, :, 0], lead_since(0.0), atol=1e-12)
-    # of 2 ms: the longest that are shorter than 1.25 ms and divide a sample are 1 ms
-    np.testing.assert_allclose(found[1, :, 0], lead_since(0.0, 0.002, 0.002) * 2 / 3, atol=1e-12)
+    # of 2 ms: the longest that are shorter than .625 ms and divide a sample are .5 ms
+    np.testing.assert_allclose(found[1, :, 0], lead_since(0.0, 0.002, 0.002) * 6 / 7, atol=1e-12)
 
 
 def test_recorded_states_are_where_both_runs_begin() -> None:

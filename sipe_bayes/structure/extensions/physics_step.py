@@ -24,12 +24,12 @@ class PhysicsStep(Extension):
     """Shorter physics steps: nothing about them is unknown."""
 
     name, kind, fixed = "physics_step", "world", True
-    shorter = 4
+    shorter = 8
     reference = "L. F. Richardson 1911"
 
     def sentence(self, site: str) -> str:
         """What it is."""
-        return "physics steps a quarter as long"
+        return "physics steps an eighth as long"
 
     def off(self, site: str, share: float) -> str:
         """See ``Extension``."""
@@ -40,7 +40,7 @@ class PhysicsStep(Extension):
         return ()
 
     def edit(self, machine: Machine, site: str) -> Edit:
-        """The option of the model, a quarter of what it was."""
+        """The option of the model, an eighth of what it was."""
         return partial(_shortened, timestep=float(machine.model.opt.timestep) / self.shorter)
 
     def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
