@@ -198,14 +198,14 @@ class _Model:
     @functools.cached_property
     def found(self) -> Discrepancy | None:
         """What it lacks, or may lack, by the training logs; None where the simulation diverges."""
-        fitting, one = self.structures.search.fitting, self.one
-        windows = fitting.windows(self.structures.simulator(one))
-        prior = QuadraticPrior.of(fitting.prior_of(windows.simulator))
+        search, one, asked = self.structures.search, self.one, self.extensions
+        logs = search.linear_model(one, every=asked is None)
         try:
-            asked = self.extensions
-            placed = None if asked is None else place_extensions(windows, one.theta, one.starts, asked)
-            at = one.theta, one.noise, one.starts, prior
-            logs = AugmentedModel(windows, *at, tell=self.tell, placed=placed)
+            if logs is None:
+                windows = search.fitting.windows(self.structures.simulator(one))
+                placed = None if asked is None else place_extensions(windows, one.theta, one.starts, asked)
+                prior = QuadraticPrior.of(search.fitting.prior_of(windows.simulator))
+                logs = AugmentedModel(windows, one.theta, one.noise, one.starts, prior, tell=self.tell, placed=placed)
             return find_discrepancy(logs, self.problem.tolerances)
         except ValueError:  # LinAlgError is one
             return None

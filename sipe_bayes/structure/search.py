@@ -39,6 +39,7 @@ from sipe_bayes.structure.comparison import choose_ties, difference, rank
 from sipe_bayes.structure.extension import Extension, Placed, members, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
 from sipe_bayes.structure.machine import Machine, machine_of
+from sipe_bayes.structure.registry import EXTENSIONS, get_extension
 from sipe_bayes.structure.state import BUDGET, DiscoverOptions, DiscoverState, Offer, Phase
 
 
@@ -70,6 +71,7 @@ class StructureSearch:
         self.ended = "budget"  # what ends a search that is cut short: that, "time", or "interrupted"
         self._machine: Machine | None = None
         self._placed: dict[str, Placed] = {}
+        self._linear: dict[bytes, AugmentedModel] = {}  # by a structure's optimum
 
     def step(self, state: DiscoverState) -> DiscoverState:
         """One fit or one ranking further."""
@@ -106,6 +108,12 @@ class StructureSearch:
         self._fit_rollouts = rollouts
         if self.progress is not None:
             self.progress(f"{self._doing}{what and ': '}{what}", self._rollouts + rollouts, self.budget)
+
+    def linear_model(self, one: FittedStructure, every: bool) -> AugmentedModel | None:
+        """Of a structure that was ranked, beside the extensions that may be tried; ``every``: where these are all."""
+        usual = {name for name in EXTENSIONS if not get_extension(name).by_name}
+        restricted = self.joints is not None or not usual <= {extension.name for extension in self.extensions}
+        return None if every and restricted else self._linear.get(one.theta.tobytes())
 
     @property
     def placed(self) -> dict[str, Placed]:
@@ -251,7 +259,8 @@ class StructureSearch:
             if rest:
                 at = here.theta, here.noise, here.starts, prior
                 tell: Tell = lambda what: self._tell(what, windows.rollouts)  # noqa: E731
-                ranked = rank_candidates(AugmentedModel(windows, *at, tell=tell, placed=rest))
+                self._linear[here.theta.tobytes()] = logs = AugmentedModel(windows, *at, tell=tell, placed=rest)
+                ranked = rank_candidates(logs)
         except BudgetExhausted:
             cut = state.phase
         except ValueError:  # LinAlgError is one: of a structure that diverges nothing can be predicted
