@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.budget import BudgetTooSmall
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -47,6 +49,7 @@ class FittedStructure:
         held: pieces that were held out.
         rollouts: that the fit took.
         settled: whether the search had come to rest.
+        behind: whether its first fit ended behind a part of it.
     """
 
     labels: tuple[str, ...]
@@ -60,6 +63,7 @@ class FittedStructure:
     held: Pieces
     rollouts: int
     settled: bool
+    behind: bool = False
 
     @property
     def spanned(self) -> FloatArray:
@@ -133,10 +137,11 @@ class Fitting:
         budget: int,
         progress: Progress | None = None,
         part: FittedStructure | None = None,
+        near: bool = False,
     ) -> FittedStructure:
         """The best optimum of a structure, and its scores.
 
-        What fits worse than a part of it has ended at another optimum: then it is fitted again, from where that ended.
+        What fits worse than a part of it has ended at another optimum: then it is fitted again, from the part's.
 
         Args:
             placed: its extensions.
@@ -144,6 +149,7 @@ class Fitting:
             budget: rollouts at most.
             progress: called along the way.
             part: a structure with some of these extensions; none by default.
+            near: whether that begins at the part's optimum, and elsewhere where it ends behind.
 
         Raises:
             BudgetTooSmall: where it ends before there is an optimum.
@@ -152,16 +158,20 @@ class Fitting:
         prior = self.prior_of(simulator)
         windows = self.windows(simulator)
         left = max(budget - self._scoring(windows), 1)
-        best, rollouts = self._optimum(simulator, prior, initial, left, progress)
-        evidence, pieces = self._scores(windows, best, prior)
-        if part is not None and evidence < part.evidence - _UNNEEDED and left > rollouts:
+        starts: list[FloatArray | None] = [None]
+        if part is not None:
             before = self.simulator([one for one in placed if one.label in part.labels])
-            starts = mapped_starts(before.model, simulator.model, part.starts)
-            other, more = self._optimum(simulator, prior, initial, left - rollouts, progress, starts)
-            rollouts += more
-            again = self._scores(windows, other, prior)
-            if again[0] > evidence:
-                best, (evidence, pieces) = other, again
+            starts.insert(1 - near, mapped_starts(before.model, simulator.model, part.starts))
+        best, rollouts = self._optimum(simulator, prior, initial, left, progress, starts[0])
+        evidence, pieces = self._scores(windows, best, prior)
+        behind = part is not None and evidence < part.evidence - _UNNEEDED
+        if behind and left > rollouts and time.monotonic() < self.ends:
+            with suppress(BudgetTooSmall, ValueError):  # the first one stands
+                other, more = self._optimum(simulator, prior, initial, left - rollouts, progress, starts[1])
+                rollouts += more
+                again = self._scores(windows, other, prior)
+                if again.evidence > evidence:
+                    best, (evidence, pieces) = other, again
         if self.holdout is not None:
             held = BoundLikelihood(self.likelihood, simulator, self.holdout)
             pull = np.linalg.solve(best.covariance, best.mean - best.theta)
@@ -183,6 +193,7 @@ class Fitting:
             pieces,
             rollouts + windows.rollouts,
             best.finding is None,
+            behind,
         )
 
     @staticmethod

@@ -349,7 +349,9 @@ class StructureSearch:
         try:
             most = self.enough(labels)
             cut = state.phase if left < most else None
-            one = self.fitting.fit(self.structure(labels), initial, max(min(most, left), 1), self._tell, part)
+            near = any(other.behind for other in state.fitted)  # other optima are near on these logs
+            budget = max(min(most, left), 1)
+            one = self.fitting.fit(self.structure(labels), initial, budget, self._tell, part, near)
             cut = state.phase if self.is_late else cut
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
             spent = state.failed_rollouts + self._fit_rollouts
