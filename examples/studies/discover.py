@@ -16,7 +16,7 @@ several that explain a log about as well are all named (a slide's motor with a z
 rail); at the right joint where they hold it there. ``first`` asks for it in the structure that is written out.
 Coverage is that of 90 % intervals of the masses, without the search and stacked over the set. Every search is one line
 in runs/, so an interrupted study goes on; results/discover.json holds the tables, results/discover.png what was named
-where.
+where, results/discover_weights.png which share of the structures holds what was planted, by weight.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import argparse
 import json
 import time
 from collections.abc import Iterable
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from _kept import fits, keep
+from scipy.stats import beta
 
 import sipe_bayes as sipe
 from sipe_bayes.core.files import write_text
@@ -49,6 +50,7 @@ from sipe_bayes.structure.registry import get_extension
 HERE = Path(__file__).parent
 RUNS = HERE / "runs" / "discover.jsonl"
 DT, STEPS = 0.01, 500
+EDGES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0)
 ROD = """<body name="{n}" pos="0 0 {z}"><joint name="{j}" axis="0 1 0" damping="0.05" armature="0.005"/>
 <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="0.6" contype="0" conaffinity="0"/>{rest}</body>"""
 HEAD = '<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>'
@@ -238,13 +240,46 @@ def mean(values: Iterable[bool]) -> float:
 
 def tables(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Shares by size and noise, and of each cell."""
-    out: dict[str, Any] = {"searches": len(rows), "all": {}, "cells": {}}
+    out: dict[str, Any] = {"searches": len(rows), "weights": reliability(rows), "all": {}, "cells": {}}
     for key in sorted({(r["size"], r["noise"]) for r in rows}):
         out["all"]["/".join(key)] = shares([r for r in rows if (r["size"], r["noise"]) == key])
     for cell in sorted({(r["machine"], r["effect"], r["size"], r["noise"]) for r in rows}):
         mine = [r for r in rows if (r["machine"], r["effect"], r["size"], r["noise"]) == cell]
         out["cells"]["/".join(cell)] = shares(mine)
     return out
+
+
+def reliability(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """By weight: of so many structures with extensions, the mean weight and which share holds what was planted."""
+    pairs = [
+        (weight, row["effect"] in {label.partition(":")[0] for label in labels})
+        for row in rows
+        for labels, weight in zip(row["set"], row["weights"], strict=True)
+        if labels
+    ]
+    out = []
+    for low, high in pairwise(EDGES):
+        mine = [pair for pair in pairs if low < pair[0] <= high]
+        if mine:
+            weight, right = np.array(mine, float).T
+            out.append({"from": low, "structures": len(mine), "weight": weight.mean(), "right": right.mean()})
+    return out
+
+
+def reliability_picture(rows: list[dict[str, Any]], path: Path) -> None:
+    """The share that is right by weight, with 90 % intervals."""
+    figure, axes = plt.subplots(figsize=(5.6, 4.6), layout="constrained")
+    axes.plot([0, 1], [0, 1], color="#999999", lw=1)
+    for one in reliability(rows):
+        n, right = one["structures"], one["structures"] * one["right"]
+        ends = beta.ppf([0.05, 0.95], right + 0.5, n - right + 0.5)
+        axes.plot([one["weight"]] * 2, ends, color="#1f5fa8", lw=2)
+        axes.plot(one["weight"], one["right"], "o", color="#1f5fa8")
+        axes.annotate(f"{n}", (one["weight"], one["right"]), (7, -12), textcoords="offset points", fontsize=9)
+    axes.set(xlim=(0, 1.04), ylim=(0, 1.04), xlabel="weight of a structure", ylabel="share that holds what was planted")
+    axes.set_title("Weights of the reported structures (numbers: how many)", fontsize=11)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
 
 
 def picture(rows: list[dict[str, Any]], path: Path) -> None:
@@ -295,7 +330,9 @@ def main() -> None:
                 flush=True,
             )
             write_text(HERE / "results" / "discover.json", json.dumps(tables(rows), indent=1) + "\n")
+    write_text(HERE / "results" / "discover.json", json.dumps(tables(rows), indent=1) + "\n")
     picture(rows, HERE / "results" / "discover.png")
+    reliability_picture(rows, HERE / "results" / "discover_weights.png")
 
 
 if __name__ == "__main__":

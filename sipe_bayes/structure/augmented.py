@@ -100,6 +100,10 @@ class Fitted:
     sizes: FloatArray
 
 
+class DivergesError(ValueError):
+    """A simulation that diverges at the estimate."""
+
+
 class AugmentedModel:
     """The logs linearised at the estimate, with K probes beside the N parameters.
 
@@ -119,7 +123,7 @@ class AugmentedModel:
         placed: extensions that are probed; default all that the registry has.
 
     Raises:
-        ValueError: where the simulation diverges at theta.
+        DivergesError: where the simulation diverges at theta.
     """
 
     def __init__(
@@ -146,7 +150,7 @@ class AugmentedModel:
         self.windows, self.theta, self.noise, self.starts = windows, theta, noise, starts
         linearisation = lin or windows.linearise(theta, starts)
         if not linearisation.valid:
-            raise ValueError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
+            raise DivergesError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
         try:
             made = probes(windows, theta, starts, placed, tell, kept)
         finally:

@@ -32,7 +32,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.budget import BudgetExhausted, BudgetTooSmall, Deadline
 from sipe_bayes.inference.recorded import Progress, Tell
 from sipe_bayes.likelihood import QuadraticPrior
-from sipe_bayes.structure.augmented import AugmentedModel
+from sipe_bayes.structure.augmented import AugmentedModel, DivergesError
 from sipe_bayes.structure.candidates import Candidate, rank_candidates
 from sipe_bayes.structure.columns import Column, channels_of, choices, is_explained, log_jacobian, moving, unexplained
 from sipe_bayes.structure.comparison import choose_ties, difference, rank
@@ -263,7 +263,7 @@ class StructureSearch:
                 ranked = rank_candidates(logs)
         except BudgetExhausted:
             cut = state.phase
-        except ValueError:  # LinAlgError is one: of a structure that diverges nothing can be predicted
+        except (DivergesError, np.linalg.LinAlgError):  # nothing can be predicted
             ranked = []
         offers = tuple(Offer(here.labels, c.placed.label, c.gain, c.theta, c.others) for c in ranked)
         ranks = state.rank_rollouts + windows.rollouts
