@@ -20,7 +20,7 @@ from sipe_bayes.structure.columns import Column, channels_of, choices, log_jacob
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.machine import Machine
 from sipe_bayes.structure.scores import Pieces
-from sipe_bayes.structure.state import DiscoverState, Phase
+from sipe_bayes.structure.state import DiscoverState, Offer, Phase
 from tests.problems.pendulums import log, pendulum
 
 FRICTION = Parameter("friction", 0.0, 0.3, targets=("joint:hinge.frictionloss",))
@@ -58,6 +58,24 @@ def test_planted_friction_is_named_and_the_mass_is_right_with_it() -> None:
     assert (np.abs(after.mean.numpy() - truth) < 4 * after.stddev.numpy()).all()
     (value,) = structures.posterior_of(structures.best).values(1000).mean(0)[2:]
     assert value == pytest.approx(0.1, rel=0.2)
+
+
+def test_what_is_not_at_its_optimum_is_fitted_again() -> None:
+    """A structure behind its part from the part's optimum; a plain model that one outdoes by more than predicted."""
+    search = searched(log(pendulum(FRICTION), [0.6, 0.08, 0.1], 5)).search
+    fitting, (friction,) = search.fitting, search.structure(["dry_friction:hinge"])
+    plain = fitting.fit([], None, 2000)
+    one, close = (fitting.fit([friction], None, 4000, part=plain, near=near) for near in (False, True))
+    best = fitting.fit([friction], None, 4000, part=replace(plain, evidence=plain.evidence + 1e3))
+    assert (one.behind, close.behind, best.behind) == (False, False, True)
+    assert best.evidence >= one.evidence > plain.evidence + 20
+    assert best.rollouts > 1.2 * one.rollouts
+    offer, bad = Offer((), friction.label, 5.0, one.theta[2:], one.theta[:2]), replace(plain, evidence=-1e3)
+    state = DiscoverState(Phase.FIT, (bad,), ranked=((),), offers=(offer,), queue=((friction.label,),), budget=30_000)
+    anew = search.step(state)
+    assert (anew.phase, anew.offers, anew.queue, anew.ranked) == (Phase.RANK, (), (), ())
+    assert [found.evidence for found in anew.fitted] == [pytest.approx(plain.evidence, abs=1.0)]
+    assert anew.rollouts > anew.fitted[0].rollouts + 10
 
 
 def test_the_set_is_the_same_for_other_seeds_threads_and_a_hundredth_less_of_the_samples() -> None:
