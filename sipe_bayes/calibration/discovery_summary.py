@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,9 +39,7 @@ from sipe_bayes.structure.augmented import AugmentedModel
 from sipe_bayes.structure.columns import corrected
 from sipe_bayes.structure.comparison import difference, rank
 from sipe_bayes.structure.discrepancy import Discrepancy, find_discrepancy
-from sipe_bayes.structure.extension import Extension
 from sipe_bayes.structure.fitted import FittedStructure
-from sipe_bayes.structure.probes import place_extensions
 from sipe_bayes.structure.state import Phase
 from sipe_bayes.structure.structures import Structures
 
@@ -73,7 +71,7 @@ def summarise(
     after = _Model(problem, structures, structures.best, tell)
     before = after
     if structures.best is not structures.plain:  # whose intervals are not asked for
-        before = _Model(problem, structures, structures.plain, tell, structures.search.extensions)
+        before = _Model(problem, structures, structures.plain, tell, asks_all=False)
     logs = ({} if problem.holdout is None else {"holdout": problem.holdout}) | {"train": problem.train}
     compared = [row for use, own in logs.items() for row in _errors(use, before, after, own)]
     stacked = Marginals.of(structures.posterior, problem.prior, seed)
@@ -161,14 +159,14 @@ def _thinned(problem: Problem, structures: Structures) -> tuple[Finding, ...]:
 class _Model:
     """A fitted structure bound to the problem's logs.
 
-    extensions: that its residuals are compared with; default all that the registry has.
+    asks_all: whether its residuals are compared with all extensions, not with those alone that were tried.
     """
 
     problem: Problem
     structures: Structures
     one: FittedStructure
     tell: Tell
-    extensions: Sequence[Extension] | None = None
+    asks_all: bool = True
 
     def windows(self, logs: Trajectories, like: BoundLikelihood | None = None) -> BoundLikelihood:
         """By which logs are scored and drawn, their columns multiplied as those of the fits were."""
@@ -198,14 +196,14 @@ class _Model:
     @functools.cached_property
     def found(self) -> Discrepancy | None:
         """What it lacks, or may lack, by the training logs; None where the simulation diverges."""
-        search, one, asked = self.structures.search, self.one, self.extensions
-        logs = search.linear_model(one, every=asked is None)
+        search, one = self.structures.search, self.one
         try:
-            if logs is None:
+            if self.asks_all and search.is_restricted:
                 windows = search.fitting.windows(self.structures.simulator(one))
-                placed = None if asked is None else place_extensions(windows, one.theta, one.starts, asked)
                 prior = QuadraticPrior.of(search.fitting.prior_of(windows.simulator))
-                logs = AugmentedModel(windows, one.theta, one.noise, one.starts, prior, tell=self.tell, placed=placed)
+                logs = AugmentedModel(windows, one.theta, one.noise, one.starts, prior, tell=self.tell)
+            else:
+                logs = search.linear_model(one, self.tell)
             return find_discrepancy(logs, self.problem.tolerances)
         except ValueError:  # LinAlgError is one
             return None

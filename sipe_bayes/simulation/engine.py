@@ -24,7 +24,7 @@ from sipe_bayes.simulation.short_delays import ShortDelays
 
 _TIME_TOLERANCE = 0.5  # of a physics step: a reset or a repeated sample is a whole one off
 _FORCES = int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-_SHORT, _LEAST = 32, 32  # up to so many steps each thread takes one piece, of as many simulated steps at least
+_SHORT, _LEAST = 32, 30  # up to so many steps each thread takes one piece, of simulated steps that pay for waking it
 HUGE = float(mujoco.mjMAXVAL)  # beyond it MuJoCo takes a number for a diverged one
 
 
@@ -74,6 +74,7 @@ class Engine:
         self.physics_size = int(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
         self._threads = mujoco.rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._alone = mujoco.rollout.Rollout(nthread=0)
+        self._least = math.ceil(_LEAST / (1 + model.nv**2 / 40))  # 60 us, of 2 + nv^2 / 20 us each
         self._datas = [mujoco.MjData(model) for _ in range(num_threads)]
         self.laws = LawSteps(model, environment.control_spec)
         self.firmware = FirmwareSteps(model)
@@ -197,8 +198,7 @@ class Engine:
         batch, steps = controls.shape[:2]
         out = np.empty((batch, steps, self.physics_size))
         sensors = np.empty((batch, steps, self.model.nsensordata)) if reads else None
-        # to wake a thread takes as long as it simulates some thirty steps of a small machine
-        pieces = min(self.num_threads, batch * steps // _LEAST) if steps <= _SHORT else self.num_threads
+        pieces = min(self.num_threads, batch * steps // self._least) if steps <= _SHORT else self.num_threads
         threads, datas = (self._threads, self._datas) if pieces > 1 else (self._alone, self._datas[:1])
         threads.rollout(
             models,

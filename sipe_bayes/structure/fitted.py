@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -158,20 +157,26 @@ class Fitting:
         prior = self.prior_of(simulator)
         windows = self.windows(simulator)
         left = max(budget - self._scoring(windows), 1)
-        starts: list[FloatArray | None] = [None]
+        begins: list[tuple[FloatArray | None, FloatArray | None]] = [(initial, None)]
         if part is not None:
-            before = self.simulator([one for one in placed if one.label in part.labels])
-            starts.insert(1 - near, mapped_starts(before.model, simulator.model, part.starts))
-        best, rollouts = self._optimum(simulator, prior, initial, left, progress, starts[0])
-        evidence, pieces = self._scores(windows, best, prior)
-        behind = part is not None and evidence < part.evidence - _UNNEEDED
-        if behind and left > rollouts and time.monotonic() < self.ends:
-            with suppress(BudgetTooSmall, ValueError):  # the first one stands
-                other, more = self._optimum(simulator, prior, initial, left - rollouts, progress, starts[1])
-                rollouts += more
-                again = self._scores(windows, other, prior)
-                if again.evidence > evidence:
-                    best, (evidence, pieces) = other, again
+            begins.insert(1 - near, self._part_optimum(placed, simulator, part))
+        rollouts, behind, found = 0, False, list[tuple[Scores, FitResult]]()
+        for number, begin in enumerate(begins):
+            laplace = self._laplace(simulator, prior, begin, left - rollouts, progress)
+            try:
+                laplace.fit(self.trajectories)
+                assert laplace.result is not None
+                found.append((self._scores(windows, laplace.result, prior), laplace.result))
+            except (BudgetTooSmall, ValueError):  # LinAlgError is one; what was found stands
+                if not found and (number + 1 == len(begins) or left <= rollouts + laplace.rollouts):
+                    raise
+            rollouts += laplace.rollouts
+            ahead = part is None or (found and found[-1][0].evidence >= part.evidence - _UNNEEDED)
+            behind |= number == 0 and not ahead
+            if ahead or (found and (left < 2 * rollouts or time.monotonic() > self.ends)):
+                break
+        (evidence, pieces), best = max(found, key=lambda one: (one[1].finding is None, one[0].evidence))
+        assert best.starts is not None
         if self.holdout is not None:
             held = BoundLikelihood(self.likelihood, simulator, self.holdout)
             pull = np.linalg.solve(best.covariance, best.mean - best.theta)
@@ -188,7 +193,7 @@ class Fitting:
             best.covariance,
             best.noise.sd,
             best.noise.tau,
-            windows.no_starts() if best.starts is None else best.starts,
+            best.starts,
             evidence,
             pieces,
             rollouts + windows.rollouts,
@@ -207,17 +212,30 @@ class Fitting:
         each = windows.num_theta + windows.num_start + 2
         return each * len(self.trajectories) + (each + windows.starts_cost) * held
 
-    def _optimum(
+    def _part_optimum(
+        self, placed: Sequence[Placed], simulator: Simulator, part: FittedStructure
+    ) -> tuple[FloatArray, FloatArray]:
+        """Theta (N + P,) and starts (W, D) of a structure where a part of it ended: further extensions do nothing."""
+        by_label = {one.label: one for one in placed}
+        own = [by_label[label] for label in part.labels]
+        n = len(self.prior.space)
+        theta, first = {"": part.theta[:n]}, n
+        for one in own:
+            theta[one.label] = part.theta[first : first + len(one.parameters)]
+            first += len(one.parameters)
+        starts = mapped_starts(self.simulator(own).model, simulator.model, part.starts)
+        return np.concatenate([theta[""], *(theta.get(one.label, one.plain) for one in placed)]), starts
+
+    def _laplace(
         self,
         simulator: Simulator,
         prior: Posterior,
-        initial: FloatArray | None,
+        begin: tuple[FloatArray | None, FloatArray | None],
         budget: int,
         progress: Progress | None,
-        starts: FloatArray | None = None,
-    ) -> tuple[FitResult, int]:
-        """The best optimum, and the rollouts that the fit took; from starts (W, D) on where they are given."""
-        given = None if initial is None else initial[None]
+    ) -> Laplace:
+        """What finds the optimum, beginning at theta (N + P,) and starts (W, D) where these are given."""
+        theta, starts = begin
         laplace = Laplace(
             simulator,
             prior=prior,
@@ -225,14 +243,12 @@ class Fitting:
             seed=self.seed,
             likelihood=self.likelihood,
             progress=progress,
-            initial=given,
+            initial=None if theta is None else theta[None],
             tuning=EVIDENCE_TUNING,
         )
         laplace.initial_starts = starts
         laplace.time_limit = max(self.ends - time.monotonic(), 0.0)
-        laplace.fit(self.trajectories)
-        assert laplace.result is not None
-        return laplace.result, laplace.rollouts
+        return laplace
 
 
 def beside(prior: Posterior, space: ParameterSpace) -> Posterior:

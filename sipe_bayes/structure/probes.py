@@ -253,32 +253,32 @@ def _of_group(windows: BoundLikelihood, theta: FloatArray, starts: FloatArray, g
     return [e for one, own in alone if own is not None for e in _simulated(windows, theta, starts, [one], own)]
 
 
-def _extended(windows: BoundLikelihood, environment: MjcfEnvironment, group: list[Placed]) -> Simulator | None:
-    """The model with them all, beside the extensions that it has; None where it can not have them.
+def _extended(windows: BoundLikelihood, environment: MjcfEnvironment, group: list[Placed]) -> BoundLikelihood | None:
+    """The logs bound to the model with them all, beside the extensions that it has; None where it can not have them.
 
     None either of what has states of its own, where the logs' recorded states are to be held to.
     """
     try:
-        larger = extended(environment, group)
+        simulator = Simulator(extended(environment, group), windows.simulator.num_threads)
+        bound = BoundLikelihood(windows.settings, simulator, windows.trajectories, windows)
     except ValueError:
         return None
-    simulator = Simulator(larger, windows.simulator.num_threads)
     sizes = [(model.nq, model.nv, model.na, model.nhistory) for model in (windows.simulator.model, simulator.model)]
-    return simulator if windows.settings.starts == "estimated" or sizes[0] == sizes[1] else None
+    return bound if windows.settings.starts == "estimated" or sizes[0] == sizes[1] else None
 
 
 def _simulated(
-    windows: BoundLikelihood, theta: FloatArray, starts: FloatArray, group: list[Placed], simulator: Simulator
+    windows: BoundLikelihood, theta: FloatArray, starts: FloatArray, group: list[Placed], bound: BoundLikelihood
 ) -> list[Effect]:
-    """Effects of extensions that the simulator's model has."""
-    bound = BoundLikelihood(windows.settings, simulator, windows.trajectories, windows)
+    """Effects of extensions that the model has to which the logs are ``bound``."""
     bound.budget, bound.deadline = windows.budget - windows.rollouts, windows.deadline
-    before, after = windows.simulator.model, simulator.model
+    before, after = windows.simulator.model, bound.simulator.model
     if (before.nq, before.nv, before.na) == (after.nq, after.nv, after.na):  # whatever history of commands it has
         own = 1 + before.nq + before.nv + before.na
         bound.reference[:, :own] = windows.reference[:, :own]
     plain = np.concatenate([theta, *(one.plain for one in group)])
-    rows, first = [plain], len(theta)
+    fixed = any(one.extension.fixed for one in group)  # there are no values at which it is the plain model
+    rows, first = [] if fixed else [plain], len(theta)
     tried = [_traded(windows.simulator.space, theta, one) for one in group]
     for probes, trade in tried:
         for probe in (probe for shape in probes for probe in shape):
@@ -297,8 +297,9 @@ def _simulated(
     finally:
         windows.rollouts += bound.rollouts
     predicted, valid = (np.concatenate(parts) for parts in zip(*runs, strict=True))
-    if any(one.extension.fixed for one in group):  # which have no values at which they are the plain model
-        predicted[:1], valid[:1] = windows.predict(theta[None], starts[None])
+    if fixed:
+        here, good = windows.predict(theta[None], starts[None], in_float64=True)
+        predicted, valid = np.concatenate([here, predicted]), np.concatenate([good, valid])
     out, at = [], 1
     for one, (probes, trade) in zip(group, tried, strict=True):
         for shape in probes:

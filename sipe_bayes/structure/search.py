@@ -2,7 +2,7 @@ r"""The search over structures: what fits best is extended, round by round; then
 
 **Steps** (``StructureSearch``), one of them a call of ``step``::
 
-    PLAIN   the model as it is
+    PLAIN   the model as it is; again, and all from here on anew, where one extension gains far more than predicted
       v
     COLUMNS where much is left: signs and units of the logs' columns
       v
@@ -30,8 +30,8 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.budget import BudgetExhausted, BudgetTooSmall, Deadline
-from sipe_bayes.inference.recorded import Progress, Tell
-from sipe_bayes.likelihood import QuadraticPrior
+from sipe_bayes.inference.recorded import Progress, Tell, silent
+from sipe_bayes.likelihood import BoundLikelihood, QuadraticPrior
 from sipe_bayes.structure.augmented import AugmentedModel, DivergesError
 from sipe_bayes.structure.candidates import Candidate, rank_candidates
 from sipe_bayes.structure.columns import Column, channels_of, choices, is_explained, log_jacobian, moving, unexplained
@@ -71,10 +71,12 @@ class StructureSearch:
         self.ended = "budget"  # what ends a search that is cut short: that, "time", or "interrupted"
         self._machine: Machine | None = None
         self._placed: dict[str, Placed] = {}
-        self._linear: dict[bytes, AugmentedModel] = {}  # by a structure's optimum
+        self._linear: dict[tuple[tuple[str, ...], bytes], AugmentedModel] = {}  # by labels and optimum
 
     def step(self, state: DiscoverState) -> DiscoverState:
         """One fit or one ranking further."""
+        if state.fitted and state.placed_at is None:
+            state = replace(state, placed_at=(state.fitted[0].theta, state.fitted[0].starts))
         self.place(state)
         self._rollouts, self._fit_rollouts = state.rollouts, 0
         self._doing = state.describe(len(self._placed))
@@ -109,11 +111,31 @@ class StructureSearch:
         if self.progress is not None:
             self.progress(f"{self._doing}{what and ': '}{what}", self._rollouts + rollouts, self.budget)
 
-    def linear_model(self, one: FittedStructure, every: bool) -> AugmentedModel | None:
-        """Of a structure that was ranked, beside the extensions that may be tried; ``every``: where these are all."""
+    @property
+    def is_restricted(self) -> bool:
+        """Whether some of the usual extensions may not be tried, or not everywhere."""
         usual = {name for name in EXTENSIONS if not get_extension(name).by_name}
-        restricted = self.joints is not None or not usual <= {extension.name for extension in self.extensions}
-        return None if every and restricted else self._linear.get(one.theta.tobytes())
+        return self.joints is not None or not usual <= {extension.name for extension in self.extensions}
+
+    def linear_model(
+        self, one: FittedStructure, tell: Tell = silent, windows: BoundLikelihood | None = None
+    ) -> AugmentedModel:
+        """Of a structure beside all extensions that may be tried beside it; made once.
+
+        Raises:
+            DivergesError: where its simulation does.
+        """
+        key, own = (one.labels, one.theta.tobytes()), self.structure(one.labels)
+        if key not in self._linear:
+            simulator = self.fitting.simulator(own)
+            windows = self.fitting.windows(simulator) if windows is None else windows
+            taken = {*one.labels, *(t for p in own for q in p.parameters for t in q.targets)}
+            every = self._placed.values()
+            rest = [p for p in every if not taken & {p.label, *(t for q in p.parameters for t in q.targets)}]
+            prior = QuadraticPrior.of(self.fitting.prior_of(simulator))
+            at = one.theta, one.noise, one.starts, prior
+            self._linear[key] = AugmentedModel(windows, *at, tell=tell, placed=rest)
+        return self._linear[key]
 
     @property
     def placed(self) -> dict[str, Placed]:
@@ -148,9 +170,8 @@ class StructureSearch:
         if self._placed or not state.fitted:
             return
         self.fitting = self.given.corrected(state.columns)
-        plain = state.fitted[0]
         windows = self.fitting.windows(self.fitting.simulator([]))
-        self._machine = machine_of(windows, plain.theta, plain.starts)
+        self._machine = machine_of(windows, *(state.placed_at or (state.fitted[0].theta, state.fitted[0].starts)))
         every = (p for e in self.extensions for p in placements(e, self._machine))
         if self.fitting.spans:
             every = (p for p in every if all(parameter.log is None for parameter in p.parameters))
@@ -198,7 +219,7 @@ class StructureSearch:
         self._placed = {}
         spent += (0 if plain is None else plain.rollouts) - best[2].rollouts
         # evidences are in the corrected logs' units from here on
-        return replace(state, fitted=(best[2],), columns=(best[1],), column_rollouts=spent)
+        return replace(state, fitted=(best[2],), columns=(best[1],), column_rollouts=spent, placed_at=None)
 
     def _try(self, columns: Sequence[Column], budget: int) -> tuple[FittedStructure | None, int]:
         """The plain model fitted to logs with columns multiplied, None where it cannot be; and the rollouts.
@@ -247,20 +268,11 @@ class StructureSearch:
 
     def _ranked(self, state: DiscoverState, here: FittedStructure) -> DiscoverState:
         """The state with predicted gains beside a structure, best first; cut where the budget ends."""
-        fitting, own = self.fitting, self.structure(here.labels)
-        simulator = fitting.simulator(own)
-        windows, prior = fitting.windows(simulator), QuadraticPrior.of(fitting.prior_of(simulator))
-        taken = {*here.labels, *(t for p in own for q in p.parameters for t in q.targets)}
-        every = self._placed.values()
-        rest = [p for p in every if not taken & {p.label, *(t for q in p.parameters for t in q.targets)}]
+        windows = self.fitting.windows(self.fitting.simulator(self.structure(here.labels)))
         windows.budget, ranked, cut = max(self.budget - state.rollouts, 0), list[Candidate](), None
-        windows.deadline = Deadline(fitting.ends)
+        windows.deadline = Deadline(self.fitting.ends)
         try:
-            if rest:
-                at = here.theta, here.noise, here.starts, prior
-                tell: Tell = lambda what: self._tell(what, windows.rollouts)  # noqa: E731
-                self._linear[here.theta.tobytes()] = logs = AugmentedModel(windows, *at, tell=tell, placed=rest)
-                ranked = rank_candidates(logs)
+            ranked = rank_candidates(self.linear_model(here, lambda what: self._tell(what, windows.rollouts), windows))
         except BudgetExhausted:
             cut = state.phase
         except (DivergesError, np.linalg.LinAlgError):  # nothing can be predicted
@@ -296,7 +308,7 @@ class StructureSearch:
         plain = state.fitted[0]
         if state.cut is not None or plain.evidence < before.evidence + self.options.least_gain:
             return state
-        spent = sum(other.rollouts for other in state.fitted[1:])
+        self._placed, spent = {}, sum(other.rollouts for other in state.fitted[1:])
         anew = DiscoverState(Phase.RANK, (plain,), columns=state.columns, pruned=((),), budget=state.budget)
         return replace(
             anew,
@@ -304,6 +316,7 @@ class StructureSearch:
             rank_rollouts=state.rank_rollouts,
             failed_rollouts=state.failed_rollouts + spent,
             untried=state.untried,
+            near=state.near,
         )
 
     def _next_beam(self, state: DiscoverState) -> tuple[tuple[str, ...], ...]:
@@ -349,10 +362,9 @@ class StructureSearch:
         try:
             most = self.enough(labels)
             cut = state.phase if left < most else None
-            near = any(other.behind for other in state.fitted)  # other optima are near on these logs
             budget = max(min(most, left), 1)
-            one = self.fitting.fit(self.structure(labels), initial, budget, self._tell, part, near)
-            cut = state.phase if self.is_late else cut
+            one = self.fitting.fit(self.structure(labels), initial, budget, self._tell, part, state.near)
+            cut, state = state.phase if self.is_late else cut, replace(state, near=state.near or one.behind)
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
             spent = state.failed_rollouts + self._fit_rollouts
             cut = cut if isinstance(error, BudgetTooSmall) else None

@@ -85,6 +85,8 @@ class DiscoverState:
         cut: what the search was doing when it was cut short; None while it is not.
         cut_off: labels of the structure whose fit was, which counts for nothing then; None where none was.
         budget: rollouts at most, of which the plain fit and the trials of columns get a share.
+        placed_at: theta and starts of the plain model whose motion bounds the extensions' parameters.
+        near: whether a fit has ended behind a part of it: other optima are near, and fits begin at their parts'.
     """
 
     phase: Phase = Phase.PLAIN
@@ -103,6 +105,8 @@ class DiscoverState:
     cut: Phase | None = None
     cut_off: tuple[str, ...] | None = None
     budget: int = 0
+    placed_at: tuple[FloatArray, FloatArray] | None = None
+    near: bool = False
 
     def with_budget(self, budget: int, plain_fit: float) -> DiscoverState:
         """It with another budget; from the beginning where a larger one would have fitted or tried more at first.

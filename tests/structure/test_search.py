@@ -6,6 +6,7 @@ One log each at fixed seeds; rates over many are measured by examples/studies/di
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import pytest
 from sipe_bayes.core.budget import BudgetTooSmall
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.likelihood import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.structure import DiscoverOptions, Extension, Restriction, Structures, discover
@@ -60,20 +62,28 @@ def test_planted_friction_is_named_and_the_mass_is_right_with_it() -> None:
     assert value == pytest.approx(0.1, rel=0.2)
 
 
-def test_what_is_not_at_its_optimum_is_fitted_again() -> None:
+def test_what_is_not_at_its_optimum_is_fitted_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """A structure behind its part from the part's optimum; a plain model that one outdoes by more than predicted."""
     search = searched(log(pendulum(FRICTION), [0.6, 0.08, 0.1], 5)).search
+    begun, fit = list[tuple[Any, Any]](), Laplace.fit
+    monkeypatch.setattr(
+        Laplace, "fit", lambda m, *a: (begun.append((m.options.initial[0], m.initial_starts)), fit(m, *a))[1]
+    )
     fitting, (friction,) = search.fitting, search.structure(["dry_friction:hinge"])
-    plain = fitting.fit([], None, 2000)
-    one, close = (fitting.fit([friction], None, 4000, part=plain, near=near) for near in (False, True))
-    best = fitting.fit([friction], None, 4000, part=replace(plain, evidence=plain.evidence + 1e3))
+    plain = fitting.fit([], np.array([0.5, 0.5]), 2000)
+    initial, begun[:] = np.array([0.5, 0.5, 0.2]), []
+    one, close = (fitting.fit([friction], initial, 4000, part=plain, near=near) for near in (False, True))
+    best = fitting.fit([friction], initial, 4000, part=replace(plain, evidence=plain.evidence + 1e3))
     assert (one.behind, close.behind, best.behind) == (False, False, True)
     assert best.evidence >= one.evidence > plain.evidence + 20
-    assert best.rollouts > 1.2 * one.rollouts
+    there = [*plain.theta, 0.0]  # of the part, without friction
+    assert [theta.tolist() for theta, _ in begun] == [initial.tolist(), there, initial.tolist(), there]
+    for (_, starts), given in zip(begun, (False, True, False, True), strict=True):
+        assert (starts is not None and np.array_equal(starts, plain.starts)) == given
     offer, bad = Offer((), friction.label, 5.0, one.theta[2:], one.theta[:2]), replace(plain, evidence=-1e3)
     state = DiscoverState(Phase.FIT, (bad,), ranked=((),), offers=(offer,), queue=((friction.label,),), budget=30_000)
     anew = search.step(state)
-    assert (anew.phase, anew.offers, anew.queue, anew.ranked) == (Phase.RANK, (), (), ())
+    assert (anew.phase, anew.offers, anew.ranked, anew.placed_at) == (Phase.RANK, (), (), None)
     assert [found.evidence for found in anew.fitted] == [pytest.approx(plain.evidence, abs=1.0)]
     assert anew.rollouts > anew.fitted[0].rollouts + 10
 
