@@ -51,7 +51,7 @@ class Paced:
         if done < total:
             what += f"; {done} of {total} rollouts"
             if done > before:
-                what += f", about {_spoken((now - began) * (total - done) / (done - before))} if all are needed"
+                what += f", at most about {_spoken((now - began) * (total - done) / (done - before))}"
         self._shown(what, done, total)
 
 
