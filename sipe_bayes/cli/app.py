@@ -151,7 +151,7 @@ def calibrate(
     discovery = None
     if discover:
         with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json, counted=False) as progress:
-            paced = discover_commands.Paced(progress)
+            paced = discover_commands.counted(progress)
             folder = Path(calibration.out) / "discover"
             discovery = run_discovery(config, folder, seed, num_threads=threads, progress=paced)
     if as_json:

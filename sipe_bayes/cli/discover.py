@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-import time
-from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,46 +15,18 @@ if TYPE_CHECKING:
     from sipe_bayes.diagnostics.discovery import Discovery
     from sipe_bayes.inference.recorded import Progress
 
-_RECENT = 60.0  # s, over which the pace is taken at least
 _WIDTH = 58  # of what a structure has
 _TRIED, _ERRORS, _VALUES = 5, 2, 3  # lines of each kind that are printed: twenty in all
 _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 
 
-class Paced:
-    """Progress that says how far a search is and about how long the rest of its budget takes, at the latest pace.
+def counted(shown: Progress) -> Progress:
+    """Progress that says how many rollouts a search has taken; how many it will take nobody knows."""
 
-    That is an estimate and no bound: structures with more pieces or shorter physics steps simulate and are checked more
-    slowly, and what comes after the search, comparing before and after, is not in it. The pace is that of the last
-    third of the time, a minute of it at least.
+    def show(what: str, done: int, total: int) -> None:
+        shown(f"{what}; {done} rollouts, at most {total}" if done < total else what, done, total)
 
-    Args:
-        shown: called with what is being done, in which that stands.
-    """
-
-    def __init__(self, shown: Progress) -> None:
-        self._shown = shown
-        self._passed: deque[tuple[int, float]] = deque()  # how much was done, and when, since where the pace begins
-        self._began = 0.0
-
-    def __call__(self, what: str, done: int, total: int) -> None:
-        """Say what is being done, and how much of all is done."""
-        now = time.monotonic()
-        self._began = self._began if self._passed else now
-        self._passed.append((done, now))
-        since = now - max(_RECENT, (now - self._began) / 3)
-        while len(self._passed) > 2 and self._passed[1][1] <= since:
-            self._passed.popleft()
-        before, began = self._passed[0]
-        if done < total:
-            what += f"; {done} of {total} rollouts"
-            if done > before:
-                what += f", at most about {_spoken((now - began) * (total - done) / (done - before))}"
-        self._shown(what, done, total)
-
-
-def _spoken(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+    return show
 
 
 def discover(
@@ -81,8 +51,8 @@ def discover(
     with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json, counted=False) as progress:
         check_least(0, seed=seed, time_limit=time_limit)
         check_least(1, budget=budget, threads=threads)
-        paced = Paced(progress)
-        discovery = run_discovery(config, out, seed, budget, only or None, without or (), threads, paced, time_limit)
+        told = counted(progress)
+        discovery = run_discovery(config, out, seed, budget, only or None, without or (), threads, told, time_limit)
     if as_json:
         print(to_json(discovery.to_dict()))
     else:

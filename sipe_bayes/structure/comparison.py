@@ -13,8 +13,9 @@ the correlation r: what counts is the effective number of pieces.
 Deviation from Vehtari et al., whose s^2 = K var(d): motions differ in what they tell, and a sum of gains that all have
 one sign, but differ, is no uncertain one.
 
-Structures within two standard errors of the best are **ties**. The set that is reported are those ties of which no
-part is a tie itself: an extension that is not needed is not reported. A structure that predicts held-out logs worse
+Structures within two standard errors of the best are **ties**. The set that is reported are those ties of which no part
+is a tie itself, or predicts no worse: an extension that is not needed is not reported. A structure that predicts
+held-out logs worse
 than the plain model by more than a standard error is none of them. **Stacking weights** of a set maximise the mean
 log of the weighted mixture (Y. Yao, A. Vehtari, D. Simpson, A. Gelman 2018, https://doi.org/10.1214/17-BA1091).
 """
@@ -69,10 +70,19 @@ def difference(one: FittedStructure, other: FittedStructure, since: int = 0) -> 
 
 
 def choose_ties(structures: Sequence[FittedStructure]) -> list[FittedStructure]:
-    """The structures within two standard errors of the best one, without those of which a part is a tie as well."""
+    """The structures within two standard errors of the best one, without those of which a part does as well.
+
+    A part does if it is a tie itself, or predicts no worse than the larger one.
+    """
     best = max(structures, key=rank)
     ties = [one for one in structures if one is best or not difference(best, one).clear]
-    return [one for one in ties if not any(set(other.labels) < set(one.labels) for other in ties)]
+    ties = [one for one in ties if all(rank(part) < rank(one) for part in _parts(one, structures))]
+    return [one for one in ties if not _parts(one, ties)]
+
+
+def _parts(one: FittedStructure, structures: Sequence[FittedStructure]) -> list[FittedStructure]:
+    """Those with some of its extensions alone."""
+    return [other for other in structures if set(other.labels) < set(one.labels)]
 
 
 def stack(structures: Sequence[FittedStructure]) -> FloatArray:

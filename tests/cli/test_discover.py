@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from sipe_bayes.cli.app import main
-from sipe_bayes.cli.discover import Paced
+from sipe_bayes.cli.discover import counted
 from tests.problems.lacking import write_lacking
 from tests.problems.swings import strict_json
 
@@ -54,33 +53,12 @@ def test_calibrates_and_then_discovers(
     assert (Path(found["out"]) / "discover" / "discovered.toml").exists()
 
 
-def test_what_the_rest_takes_is_an_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the pace of this run, with all that it did beside rollouts; an earlier run's count for nothing."""
-    shown = paced(monkeypatch, (1000, 100.0), (1000, 110.0), (1200, 140.0), (2000, 150.0))
-    assert shown == [
-        "fitting; 1000 of 2000 rollouts",
-        "fitting; 1000 of 2000 rollouts",
-        "fitting; 1200 of 2000 rollouts, at most about 3 min",
-        "fitting",
-    ]
-
-
-def test_the_pace_is_the_latest(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorter physics steps take eight times as long; what was done before says nothing of the rest."""
-    quick, slow = [(10 * k, 10.0 * k) for k in range(1, 7)], [(60 + k, 60 + 20.0 * k) for k in range(15)]
-    shown = paced(monkeypatch, *quick, *slow)
-    assert "60 of 100 rollouts, at most about 40 s" in shown[5]
-    assert "74 of 100 rollouts, at most about 9 min" in shown[-1]  # 26 rollouts of 20 s
-
-
-def paced(monkeypatch: pytest.MonkeyPatch, *done: tuple[int, float]) -> list[str]:
-    """What is shown of rollouts and when they were done, of as many as the next hundred or thousand."""
-    clock, shown = iter([seconds for _, seconds in done]), list[str]()
-    monkeypatch.setattr("sipe_bayes.cli.discover.time", SimpleNamespace(monotonic=lambda: next(clock)))
-    says = Paced(lambda what, _, __: shown.append(what))
-    for count, _ in done:
-        says("fitting", count, 2000 if count > 100 else 100)
-    return shown
+def test_a_search_says_how_many_rollouts_it_took() -> None:
+    shown = list[str]()
+    says = counted(lambda what, _, __: shown.append(what))
+    for done in (1200, 2000):
+        says("fitting", done, 2000)
+    assert shown == ["fitting; 1200 rollouts, at most 2000", "fitting"]
 
 
 def words_of(config: Path) -> list[str]:

@@ -71,7 +71,8 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
     "a tie": (
         make_discovery(FRICTION, tied=(TWIN,)),
         "fair",
-        "These structures predict the logs as well: drag at hinge (difference -4.0 ± 9.0 nats). The simplest of "
+        "Within two standard errors these structures predict the logs as well: drag at hinge (difference "
+        "-4.0 ± 9.0 nats). The simplest of "
         "them, dry friction at hinge, is written to discovered.xml. More logs, or other motions, may tell.",
     ),
     "a tie, parts of the logs": (
@@ -92,7 +93,7 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
     "small": (changed(FRICTION, **left(SMALL)), "fair", "something small, like drag at hinge"),
     "large": (changed(FRICTION, **left(LARGE)), "bad", "it looks most like drag at hinge"),
     "unknown": (changed(FRICTION, **left(None)), "fair", "cannot be told"),
-    "trusted": (make_discovery(FRICTION), "good", "Values may be trusted within the intervals stacked"),
+    "trusted": (make_discovery(FRICTION), "good", "Values may be trusted within the printed intervals"),
     "small, trusted": (changed(FRICTION, **left(SMALL)), "good", "Values may be trusted within"),
     "not trusted": (changed(FRICTION, **left(LARGE)), "bad", "No value may be trusted within its interval yet"),
     "unknown, not trusted": (changed(FRICTION, **left(None)), "bad", "No value may be trusted within its interval yet"),
@@ -139,7 +140,7 @@ def test_what_to_do_next(discovery: Discovery, words: str) -> None:
 
 
 def test_a_structure_that_may_be_another_is_not_calibrated_without_a_word() -> None:
-    assert next_steps(make_discovery(FRICTION, tied=(TWIN,))).endswith("for that structure alone: use those above")
+    assert next_steps(make_discovery(FRICTION, tied=(TWIN,))).endswith("those above for all of the set")
 
 
 def test_twenty_lines_hold_whatever_there_is_to_say(capsys: pytest.CaptureFixture[str]) -> None:
@@ -176,7 +177,7 @@ def test_page_says_it_all_and_escapes_names() -> None:
         "MJCF has no element for stribeck at hinge",
         "The nearest element is LuGre",
         "Delay at angle is of the measurement and has no place in discovered.xml",
-        "These structures predict the logs as well: drag at hinge (difference -4.0 ± 9.0 nats)",
+        "these structures predict the logs as well: drag at hinge (difference -4.0 ± 9.0 nats)",
         "a spring at hinge +2.0 not to its end",
         "Next: sipe calibrate runs/pendulum-discover/discovered.toml",
     ):

@@ -88,6 +88,9 @@ def test_equivalent_structures_are_ties_and_what_is_not_needed_is_left_out() -> 
     assert [x.labels for x in found] == [("a",), ("b",)]
     assert stack(found) == pytest.approx([0.5, 0.5])
     assert choose_ties([plain, structure("c", *np.full(8, 0.1))]) == [plain]
+    best, larger = structure("d", *np.full(8, 9.0)), structure("ae", *[-30.0, 60.0, -30.0, 60.0, -30.0, 0.0, 0.0, 0.0])
+    assert not difference(best, larger).clear  # which predicts worse than its part, itself no tie
+    assert choose_ties([plain, best, one, larger]) == [best]
 
 
 def test_stacking_weights_maximise_the_mixture() -> None:

@@ -74,7 +74,7 @@ def headline(discovery: Discovery) -> Verdict:
     if kept and (cut_short(discovery) or not discovery.settled):
         among = f"Not all of the {len(discovery.rows)} structures were fitted to their end; of these"
         if cut_short(discovery):
-            among = f"Of the {len(discovery.rows)} structures that were fitted before the budget was spent"
+            among = f"Of the {len(discovery.rows)} structures that were fitted before the search ended"
         return Verdict("bad", f"{among}, the simplest of the best has {kept}.")
     if kept:
         best = discovery.rows[0]
@@ -115,7 +115,8 @@ def ties(discovery: Discovery) -> Verdict | None:
         more = [f"{len(others) - _NAMED} more"] if len(others) > _NAMED else []
         parts = any(one.code is Code.SEARCHED_ON_PARTS for one in discovery.findings)
         would = "Logs cut to where they differ, or other motions," if parts else "More logs, or other motions,"
-        texts.append(f"These structures predict the logs as well: {listed([*others[:_NAMED], *more])}.")
+        named = listed([*others[:_NAMED], *more])
+        texts.append(f"Within two standard errors these structures predict the logs as well: {named}.")
         texts.append(f"The simplest of them, {structure_text(best)}, is written to discovered.xml. {would} may tell.")
     larger = max(discovery.rows, key=lambda row: row.gain)
     if not larger.tied and larger.gain > best.gain and set(best.labels) < set(larger.labels):
@@ -153,7 +154,7 @@ def trust(discovery: Discovery) -> Verdict:
     if not discovery.settled:
         return Verdict("bad", "No value may be trusted yet: the search ended before it had settled; raise its budget.")
     if discovery.passes:
-        return Verdict("good", "Values may be trusted within the intervals stacked over the structures, no narrower.")
+        return Verdict("good", "Values may be trusted within the printed intervals.")
     if any(p.further is not None for p in discovery.parameters):
         text = "Use values within the intervals with what the model lacks: the plain ones are those of models that are"
         return Verdict("fair", f"{text} still wrong.")
@@ -171,7 +172,7 @@ def next_steps(discovery: Discovery) -> str:
     """What to do with it."""
     out = Path(discovery.out)
     if discovery.kept or discovery.columns:
-        alone = "; its intervals hold for that structure alone: use those above"
+        alone = "; its intervals hold for this structure alone, those above for all of the set"
         onward = f"sipe calibrate {out / 'discovered.toml'} (the model with these values: {out / 'discovered.xml'})"
         return onward + alone * bool(alternatives(discovery))
     if cut_short(discovery):
