@@ -276,7 +276,7 @@ def reliability_picture(rows: list[dict[str, Any]], path: Path) -> None:
         axes.plot([one["weight"]] * 2, ends, color="#1f5fa8", lw=2)
         axes.plot(one["weight"], one["right"], "o", color="#1f5fa8")
         axes.annotate(f"{n}", (one["weight"], one["right"]), (7, -12), textcoords="offset points", fontsize=9)
-    axes.set(xlim=(0, 1.04), ylim=(0, 1.04), xlabel="weight of a structure", ylabel="share that holds what was planted")
+    axes.set(xlim=(0, 1.1), ylim=(0, 1.04), xlabel="weight of a structure", ylabel="share that holds what was planted")
     axes.set_title("Weights of the reported structures (numbers: how many)", fontsize=11)
     figure.savefig(path, dpi=120)
     plt.close(figure)
