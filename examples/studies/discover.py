@@ -227,6 +227,9 @@ def shares(rows: list[dict[str, Any]]) -> dict[str, Any]:
         kinds = [{name.partition(":")[0] for name in answer(r)} for r in planted]
         out["named"] = mean(r["effect"] in kind for r, kind in zip(planted, kinds, strict=True))
         out["at the right place"] = mean(r["planted"] in answer(r) for r in planted)
+        out["alone"] = mean(
+            len(r["set"]) == 1 and kind == {r["effect"]} for r, kind in zip(planted, kinds, strict=True)
+        )
         out["first"] = mean(r["planted"] in r["named"] for r in planted)
     for key in ("before", "after"):
         out[f"coverage {key}"] = mean(x for r in rows for x in r["inside"][key])

@@ -28,7 +28,7 @@ from sipe_bayes.structure.scores import Pieces, Scores, predictive, scores
 
 _STEPS = 40  # of a fit, which takes twenty to thirty
 _EDGE = 1e-3  # of the cube: at a bound
-_UNNEEDED = 10.0  # nats of evidence that extensions cost at most which explain nothing
+_UNNEEDED = 10.0  # nats: an extension that explains nothing lowers the evidence by no more
 _FLAT_SD = 1e3  # of the cube: stands for a uniform prior beside a normal one
 
 
@@ -140,7 +140,7 @@ class Fitting:
     ) -> FittedStructure:
         """The best optimum of a structure, and its scores.
 
-        What fits worse than a part of it has ended at another optimum: then it is fitted again, from the part's.
+        A structure that fits worse than a part of it is at another local optimum; it is fitted again from the part's.
 
         Args:
             placed: its extensions.
@@ -148,7 +148,7 @@ class Fitting:
             budget: rollouts at most.
             progress: called along the way.
             part: a structure with some of these extensions; none by default.
-            near: whether that begins at the part's optimum, and elsewhere where it ends behind.
+            near: whether the fit from the part's optimum comes first, and the other one only if that ends behind.
 
         Raises:
             BudgetTooSmall: where it ends before there is an optimum.
@@ -217,13 +217,13 @@ class Fitting:
     ) -> tuple[FloatArray, FloatArray]:
         """Theta (N + P,) and starts (W, D) of a structure where a part of it ended: further extensions do nothing."""
         by_label = {one.label: one for one in placed}
-        own = [by_label[label] for label in part.labels]
+        extensions = [by_label[label] for label in part.labels]
         n = len(self.prior.space)
         theta, first = {"": part.theta[:n]}, n
-        for one in own:
+        for one in extensions:
             theta[one.label] = part.theta[first : first + len(one.parameters)]
             first += len(one.parameters)
-        starts = mapped_starts(self.simulator(own).model, simulator.model, part.starts)
+        starts = mapped_starts(self.simulator(extensions).model, simulator.model, part.starts)
         return np.concatenate([theta[""], *(theta.get(one.label, one.plain) for one in placed)]), starts
 
     def _laplace(

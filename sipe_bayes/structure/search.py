@@ -2,7 +2,7 @@ r"""The search over structures: what fits best is extended, round by round; then
 
 **Steps** (``StructureSearch``), one of them a call of ``step``::
 
-    PLAIN   the model as it is; again, and all from here on anew, where one extension gains far more than predicted
+    PLAIN   the model as it is; fitted again, and the search repeated, where an extension gains far more than predicted
       v
     COLUMNS where much is left: signs and units of the logs' columns
       v
@@ -300,9 +300,9 @@ class StructureSearch:
         return replace(state, beam=beam, phase=Phase.RANK) if beam else replace(state, phase=Phase.PRUNE)
 
     def _replaced(self, state: DiscoverState, one: FittedStructure) -> DiscoverState:
-        """The plain model from where a structure ended that gains far more than predicted: at a better optimum anew.
+        """Re-estimate the plain model from the optimum of a structure that gains far more than predicted.
 
-        An extension can not gain more than the model is linear for, but where it led the search elsewhere.
+        Such a gain is that of another local optimum. If the plain model reaches it, the search is repeated from there.
         """
         before, state = state.fitted[0], self._without(state, one, ())
         plain = state.fitted[0]

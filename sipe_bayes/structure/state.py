@@ -85,8 +85,8 @@ class DiscoverState:
         cut: what the search was doing when it was cut short; None while it is not.
         cut_off: labels of the structure whose fit was, which counts for nothing then; None where none was.
         budget: rollouts at most, of which the plain fit and the trials of columns get a share.
-        placed_at: theta and starts of the plain model whose motion bounds the extensions' parameters.
-        near: whether a fit has ended behind a part of it: other optima are near, and fits begin at their parts'.
+        placed_at: theta and initial states of the plain model, by whose motion extensions' parameters have bounds.
+        near: whether a structure has fitted worse than a part of it; then fits begin at the optimum of a part.
     """
 
     phase: Phase = Phase.PLAIN
