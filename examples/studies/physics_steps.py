@@ -40,7 +40,7 @@ from sipe_bayes.likelihood import Noise, QuadraticPrior, bind
 from sipe_bayes.structure.augmented import AugmentedModel
 from sipe_bayes.structure.discrepancy import find_discrepancy
 from sipe_bayes.structure.extension import WORLD
-from sipe_bayes.structure.extensions.physics_step import PhysicsStep
+from sipe_bayes.structure.extensions.numerics import PhysicsStep
 from sipe_bayes.structure.tolerances import Tolerances
 
 RESULTS = Path(__file__).parent / "results" / "physics_steps.json"

@@ -47,7 +47,7 @@ from sipe_bayes.core.options import Options, option
 from sipe_bayes.likelihood import UNIFORM_PRECISION, BoundLikelihood, Noise
 from sipe_bayes.posterior import GaussianMixture, Particles, Posterior
 from sipe_bayes.structure.augmented import AtNoise, AugmentedModel
-from sipe_bayes.structure.extensions.physics_step import PhysicsStep
+from sipe_bayes.structure.extensions.numerics import PhysicsStep
 from sipe_bayes.structure.probes import Probe
 from sipe_bayes.structure.single_effects import EFFECTS, Columns, Effects, find_effects
 from sipe_bayes.structure.tolerances import EXACT, Tolerances

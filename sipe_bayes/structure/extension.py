@@ -187,9 +187,9 @@ def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
     for site in (*sites[extension.kind], *_together(extension, sites[extension.kind], machine)):
         try:
             parameters = tuple(_with_own(machine, p) for p in extension.parameters(machine, site))
-            if not (parameters or extension.fixed) or any(t in taken for p in parameters for t in p.targets):
-                continue
             edit = extension.edit(machine, site)
+            if not (parameters or (extension.fixed and edit)) or any(t in taken for p in parameters for t in p.targets):
+                continue
             draft = Placed(extension, site, parameters, edit, np.zeros((0, 0, len(parameters))))
             _ = draft.sentence
         except Exception as error:  # the user's own code may raise anything

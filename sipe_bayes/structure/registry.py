@@ -30,15 +30,13 @@ _CLASSES = {  # name: module and class
     "mass": "body:Mass",
     "log_mass": "body:LogMass",
     "centre_of_mass": "body:CentreOfMass",
-    "sensor_offset": "world:SensorOffset",
-    "sensor_scale": "world:SensorScale",
     "sensor_delay": "world:SensorDelay",
     "sensor_filter": "world:SensorFilter",
     "gravity_tilt": "world:GravityTilt",
     "base_compliance": "elastic:BaseCompliance",
     "supply_sag": "world:SupplySag",
-    "medium_drag": "world:MediumDrag",
-    "physics_step": "physics_step:PhysicsStep",
+    "physics_step": "numerics:PhysicsStep",
+    "hard_friction": "numerics:HardFriction",
     "residual": "world:Residual",
 }
 EXTENSIONS = (*ROWS, *_CLASSES)

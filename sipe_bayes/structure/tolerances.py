@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from sipe_bayes.structure.extensions.physics_step import PhysicsStep
+from sipe_bayes.structure.extensions.numerics import PhysicsStep
 from sipe_bayes.structure.probes import Probe
 
 

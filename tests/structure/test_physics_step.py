@@ -24,7 +24,7 @@ from sipe_bayes.structure.augmented import AugmentedModel
 from sipe_bayes.structure.candidates import rank_candidates
 from sipe_bayes.structure.discrepancy import find_discrepancy
 from sipe_bayes.structure.extension import placements
-from sipe_bayes.structure.extensions.physics_step import PhysicsStep
+from sipe_bayes.structure.extensions.numerics import PhysicsStep
 from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.probes import effects
 from sipe_bayes.structure.registry import EXTENSIONS

@@ -25,7 +25,7 @@ from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.structure.augmented import AugmentedModel
 from sipe_bayes.structure.discover import FEWEST_APART
 from sipe_bayes.structure.discrepancy import Discrepancy, LogEstimate, draw_differing, find_discrepancy
-from sipe_bayes.structure.extensions.physics_step import PhysicsStep
+from sipe_bayes.structure.extensions.numerics import PhysicsStep
 
 _NAMED = 3  # numbers whose error the logs do not show
 

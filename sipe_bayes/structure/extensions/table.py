@@ -9,19 +9,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
-from sipe_bayes.structure.extension import PROBE, Extension, Kind, members
+from sipe_bayes.structure.extension import PROBE, WORLD, Extension, Kind, members
 from sipe_bayes.structure.machine import Machine
 
 Probes = tuple[tuple[tuple[float, ...], ...], ...]
 """Theta of the parameters at which a row is tried: of each shape its directions."""
 _SPRING: Probes = (((PROBE, 0.25), (PROBE, 0.75)),)  # weak, at rest at either side: the force is a sum of the two
+_OWNERS = {"channel": "sensor"}  # of targets, where not the kind itself
 _OVER_RANGES: Probes = (((PROBE, 0.2),), ((PROBE, 0.5),), ((PROBE, 0.8),))  # a little of it, over three distances
 
 
@@ -32,7 +33,7 @@ class Sizes:
     Args:
         force: the usual one; of several actuators the largest.
         velocity: root-mean-square, of an actuator that of the joint that it drives.
-        position: spread, of a tendon that of its length.
+        position: spread, of a tendon that of its length, of a channel what it measures.
         inertia: that a joint moves.
         command: the largest.
         length: a tendon's mean.
@@ -61,6 +62,8 @@ class Sizes:
         if kind == "tendon":
             own = machine.tendons[site]
             return cls(own.force, own.velocity, own.stretch, length=own.length, least=own.least, dt=dt, step=step)
+        if kind in ("channel", "world"):
+            return cls(position=machine.channels.get(site, math.nan), dt=dt, step=step)
         names = members(site)
         driven = machine.joint_of(site) if len(names) == 1 else None
         velocity = math.nan if driven is None else machine.joints[driven].velocity
@@ -77,7 +80,7 @@ Bound = float | Callable[[Sizes], float]
 
 @dataclass(frozen=True)
 class Unknown:
-    """A parameter of a row: ``SITE.name``, its bounds, and the target behind the site's, by default its name."""
+    """A parameter of a row: ``SITE.name``, bounds, the target behind the site's (by default its name), the prior."""
 
     name: str
     low: Bound
@@ -85,14 +88,16 @@ class Unknown:
     description: str
     target: str = ""
     scale: Literal["linear", "log"] = "linear"
+    prior: tuple[float, float] | tuple[None, None] = (None, None)
 
     def at(self, kind: str, site: str, sizes: Sizes) -> Parameter:
         """At a site."""
         low, high = (bound if isinstance(bound, float) else bound(sizes) for bound in (self.low, self.high))
-        targets = tuple(f"{kind}:{member}.{self.target or self.name}" for member in members(site))
-        return Parameter(
-            f"{site}.{self.name}", low, high, scale=self.scale, targets=targets, description=self.description
-        )
+        owner, target = _OWNERS.get(kind, kind), self.target or self.name
+        targets = (target,) if kind == WORLD else tuple(f"{owner}:{member}.{target}" for member in members(site))
+        name = self.name if kind == WORLD else f"{site}.{self.name}"
+        made = Parameter(name, low, high, scale=self.scale, targets=targets, description=self.description)
+        return replace(made, prior_mean=self.prior[0], prior_sd=self.prior[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -356,6 +361,22 @@ _ROWS = (
         "G. Tao and P. V. Kokotovic 1996, Adaptive Control of Systems with Actuator and Sensor Nonlinearities",
         (Unknown("dead_zone", 0.0, lambda s: s.force, "force of which nothing arrives"),),
         "dry friction, where the actuator drives a joint", native=False, alike=True,
+    ),
+    Row(
+        "sensor_offset", "channel", "a zero error of {}", "-",
+        (Unknown("offset", lambda s: -s.position / 2, lambda s: s.position / 2, "added to the measurement", "bias"),),
+    ),
+    Row(  # MuJoCo knows no such sensor: sipe_bayes does it to what is simulated
+        "sensor_scale", "channel", "a factor of {}", "-",
+        (Unknown("scale", 0.5, 1.5, "measured for what there is", prior=(1.0, 0.2)),), native=False,
+    ),
+    Row(  # MuJoCo takes each body for the box or ellipsoid of its inertia
+        "medium_drag", "world", "drag of the medium around it",
+        "MuJoCo documentation, passive forces, option density and viscosity",
+        (
+            Unknown("medium_density", 0.0, 1200.0, "of the medium; air has 1.2, brine 1200", "option.density"),
+            Unknown("medium_viscosity", 0.0, 1.5, "of the medium; air has 2e-5, glycerine 1.5", "option.viscosity"),
+        ),
     ),
 )  # fmt: skip
 ROWS = {row.name: row for row in _ROWS}

@@ -14,57 +14,6 @@ from sipe_bayes.envs.sensing import sensed_channels, vector_of
 from sipe_bayes.structure.extension import Extension, members
 from sipe_bayes.structure.machine import Machine
 
-_DENSEST, _MOST_VISCOUS = 1200.0, 1.5  # kg/m^3 and Pa s: brine and glycerine
-
-
-class SensorOffset(Extension):
-    """A zero error of a measurement."""
-
-    name, kind = "sensor_offset", "channel"
-    reference = "-"
-
-    def sentence(self, site: str) -> str:
-        """What it is."""
-        return f"a zero error of {site}"
-
-    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
-        """Up to a half of what the channel measures."""
-        most = machine.channels[site] / 2
-        return (
-            Parameter(
-                f"{site}.offset", -most, most, targets=(f"sensor:{site}.bias",), description="added to the measurement"
-            ),
-        )
-
-
-class SensorScale(Extension):
-    """A measurement that is a factor off.
-
-    MuJoCo knows no such sensor: sipe_bayes does it to what is simulated.
-    """
-
-    name, kind = "sensor_scale", "channel"
-    reference = "-"
-    native = False
-
-    def sentence(self, site: str) -> str:
-        """What it is."""
-        return f"a factor of {site}"
-
-    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
-        """Around one, with a normal prior of a fifth."""
-        return (
-            Parameter(
-                f"{site}.scale",
-                0.5,
-                1.5,
-                targets=(f"sensor:{site}.scale",),
-                prior_mean=1.0,
-                prior_sd=0.2,
-                description="measured for what there is",
-            ),
-        )
-
 
 class SensorDelay(Extension):
     """A measurement that comes late.
@@ -236,35 +185,6 @@ class SupplySag(Extension):
                 0.5 / sum(machine.forces[a] for a in driving),
                 targets=tuple(f"actuator:{a}.supply_sag" for a in driving),
                 description="relative loss of every force per force of all",
-            ),
-        )
-
-
-class MediumDrag(Extension):
-    """Drag of the medium that the machine moves in.
-
-    MuJoCo takes each body for the box or ellipsoid of its inertia.
-    """
-
-    name, kind = "medium_drag", "world"
-    reference = "MuJoCo documentation, passive forces, option density and viscosity"
-
-    def sentence(self, site: str) -> str:
-        """What it is."""
-        return "drag of the medium around it"
-
-    def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
-        """From vacuum to brine, and to glycerine."""
-        return (
-            Parameter(
-                "medium_density", 0.0, _DENSEST, targets=("option.density",), description="of the medium; air has 1.2"
-            ),
-            Parameter(
-                "medium_viscosity",
-                0.0,
-                _MOST_VISCOUS,
-                targets=("option.viscosity",),
-                description="of the medium; air has 2e-5",
             ),
         )
 
