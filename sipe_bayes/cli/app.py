@@ -22,6 +22,7 @@ from sipe_bayes.cli import leaderboard as leaderboard_commands
 from sipe_bayes.cli import suggest as suggest_commands
 from sipe_bayes.cli import train as rl_commands
 from sipe_bayes.cli import transfer as transfer_commands
+from sipe_bayes.cli import validate as validate_commands
 from sipe_bayes.cli import video as video_commands
 from sipe_bayes.cli.check import SimulatedOn
 from sipe_bayes.cli.errors import (
@@ -355,7 +356,14 @@ def _report(calibration: Calibration) -> str:
 
 _PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # in the order in which a newcomer needs them
     "Your machine": (
-        *(init_commands.init, calibrate, discover_commands.discover, check_commands.check, suggest_commands.suggest),
+        *(
+            init_commands.init,
+            validate_commands.validate,
+            calibrate,
+            discover_commands.discover,
+            check_commands.check,
+            suggest_commands.suggest,
+        ),
         *(video_commands.video, explain_commands.explain),
     ),
     "Environments and policies": (envs, rl_commands.train, rl_commands.agents),

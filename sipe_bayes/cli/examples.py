@@ -6,6 +6,7 @@ import typer
 
 EXAMPLES = {
     "init": "sipe init robot.xml log1.csv log2.csv --out robot.toml",
+    "validate": "sipe validate robot.toml",
     "calibrate": "sipe calibrate robot.toml --out runs/robot",
     "discover": "sipe discover robot.toml --only dry_friction --only delay",
     "check": "sipe check robot.toml laplace --truths 100",

@@ -17,26 +17,9 @@ def init(
     out: Annotated[Path, typer.Option(help="The configuration to write.")] = Path("calibrate.toml"),
     rate: Annotated[float | None, typer.Option(min=1e-3, help="Hz of the rows, of logs without a clock.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite it.")] = False,
-    check: Annotated[Path | None, typer.Option(help="Say instead what is odd in this configuration.")] = None,
 ) -> None:
     """A first configuration of `sipe calibrate` from a model and its logs, each guess with its evidence."""
     with exit_on_error():
-        if check is not None:
-            if model is not None or logs or force:
-                raise ValueError("--check: takes one configuration and nothing else; drop the other arguments")
-            from sipe_bayes.calibration.init.check import checked
-
-            with ProgressBar(unit="configuration", counted=False) as progress:
-                progress(f"holding {check} against simulations of its logs", 0, 1)
-                result = checked(check)
-            agreed = "units, signs, delays and columns agree with simulations"
-            untold = f"in what simulations tell, which leaves {len(result.doubts)} open"
-            nothing = f"{check}: nothing is odd{f' {untold}' if result.doubts else f': {agreed}'}"
-            for line in [*(result.odd or [nothing]), *(f"OPEN: {doubt}" for doubt in result.doubts)]:
-                print(line)
-            if result.odd:
-                raise typer.Exit(1)
-            return
         if model is None or not logs:
             raise ValueError("expected a model and at least one log: sipe init MODEL.xml LOG...")
         if out.exists() and not force:

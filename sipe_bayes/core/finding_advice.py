@@ -97,7 +97,7 @@ ADVICE: dict[Code, str] = {
     ),
     Code.COLUMNS_UNTRIED: (
         "Much of a channel is unexplained, and not every column could be tried for it. Look at the signals in the "
-        "report: a wrong sign mirrors, a wrong unit scales. `sipe init --check` asks the logs too."
+        "report: a wrong sign mirrors, a wrong unit scales. `sipe validate` asks the logs too."
     ),
     Code.SEARCH_CUT_SHORT: "Raise `budget`. The message's estimate is a stage on the way.",
     Code.SEARCH_UNSETTLED: (

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from sipe_bayes.likelihood.starts.estimates import first_states as first_states
     from sipe_bayes.likelihood.starts.estimates import tied_joints as tied_joints
     from sipe_bayes.likelihood.starts.estimates import unmeasured_joints as unmeasured_joints
-    from sipe_bayes.likelihood.starts.history import with_history as with_history
     from sipe_bayes.likelihood.state_space.process_noise import process_noise_findings as process_noise_findings
     from sipe_bayes.likelihood.wild_samples import wild_residuals as wild_residuals
     from sipe_bayes.likelihood.windows import Linearisation as Linearisation

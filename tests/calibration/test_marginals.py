@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from sipe_bayes.calibration.gathered import Marginals, no_rigid_bodies
-from sipe_bayes.calibration.init.check import checked
 from sipe_bayes.calibration.run import run
+from sipe_bayes.calibration.validate import validate_config
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -83,7 +83,7 @@ bounds = [0.002, {high}]
 def test_a_prior_that_hardly_any_body_has_is_told_before_the_fit(config: Path, high: float, odd: bool) -> None:
     """A ball's moments are .004 each, of which the third is .008 at most; by the check and ahead of a calibration."""
     config.write_text(config.read_text() + MOMENT.format(high=high))
-    assert any("of the prior no rigid body has it" in line for line in checked(config).odd) == odd
+    assert any("of the prior no rigid body has it" in line for line in validate_config(config).odd) == odd
     lines: list[str] = []
     run(config, budget=40, out=config.parent / "out", tell=lines.append)
     assert any("of the prior no rigid body has it" in line for line in lines) == odd

@@ -1,31 +1,30 @@
-"""Before a fit takes minutes: which columns no simulation follows, whatever the unknowns."""
+"""Before a fit takes minutes: which columns the model explains nothing of, whatever its gains and friction."""
 
 from __future__ import annotations
 
-from sipe_bayes.calibration.init.fits import fit
-from sipe_bayes.calibration.init.trials import Trial
-from sipe_bayes.calibration.init.windows import FEW
+from sipe_bayes.calibration.init.regression import Regression
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.findings import Code, Finding, finding
 
-_SHARE = 0.1  # of the time in which the motion goes to and fro: what short windows miss, no start explains
-_ROUNDS = 6  # of the fit, where the model as given misses a column
+_LEFT = 0.9  # of a joint's forces, from which nothing of them is explained
+_TIMES = 2.0  # what is left with commands of any sign
 
 
 def not_followed(problem: Problem) -> tuple[Finding, ...]:
-    """One for each fitted column that moves, and that windows follow hardly better than a straight line does.
-
-    First with the model as given, then with its unknowns fitted in a few steps: seconds, where the fit takes minutes.
+    """One for each fitted joint's column that moves, and whose forces the model hardly explains.
 
     Args:
         problem: a configuration read and bound.
     """
-    trial = Trial(problem.environment, list(problem.train), FEW, _SHARE)
-    lost = trial.unfollowed(trial.given, trial.theta)
-    if lost:
-        left = fit(trial, trial.given, (0,), _ROUNDS)
-        lost = trial.unfollowed(trial.given, left.theta)
-    channels = problem.environment.channels
-    fitted = problem.likelihood.fit or channels
-    names = {channels[k]: by for k, by in lost.items() if channels[k] in fitted}
-    return tuple(finding(Code.COLUMN_NOT_FOLLOWED, channel=name, times=by) for name, by in names.items())
+    regression = Regression(problem.environment, list(problem.train))
+    model, other = regression.simulator.model, regression.fit(regression.given)
+    regression.one_way[:] = True  # signs are those of the configuration
+    outcome = regression.fit(regression.given)
+    fitted, out = problem.likelihood.fit or problem.environment.channels, []
+    for channel in problem.environment.measurements:
+        if channel.label in fitted and channel.target.startswith("joint:") and channel.target.endswith(".position"):
+            dof = int(model.joint(channel.target[6:].rpartition(".")[0]).dofadr[0])
+            lost = outcome.miss[dof] > min(_LEFT, _TIMES * other.miss[dof])
+            if regression.known[dof] and lost:
+                out.append(finding(Code.COLUMN_NOT_FOLLOWED, channel=channel.label, times=float(outcome.miss[dof])))
+    return tuple(out)

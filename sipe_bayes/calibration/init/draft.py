@@ -24,7 +24,6 @@ Row = dict[str, object]
 _FLOWN = 2.0  # against unlikely units of what thrust moves: the smaller a motion is read, the better all fits
 _UNLIKELY = 0.01  # of the logarithm of misses, by which what is not likely has to be better
 _CUSTOM = float(np.log(1.5))  # against units where a kind of log usually has a share of the joint's range
-_TURNED = float(np.log(2.0))  # and a sign that a gyro speaks against, which may be mounted otherwise
 
 
 class Scale(NamedTuple):
@@ -58,7 +57,6 @@ class Reading:
         reach: that range, rad or m.
         ends: what the column says at the ends of it, where it is read so.
         supply: column of the voltage that a duty is a share of, and its unit.
-        turning: the sign that a gyro speaks for; 0 where none does.
         notes: the evidence, each a comment.
         doubts: what could not be decided, each a comment and told.
         instead: lines of TOML that are the alternative where something could not be decided.
@@ -77,7 +75,6 @@ class Reading:
     reach: tuple[float, float] | None = None
     ends: tuple[float, float] | None = None
     supply: tuple[str, str] | None = None
-    turning: int = 0
     notes: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
     instead: tuple[str, ...] = ()
@@ -274,11 +271,6 @@ class Question:
         """Whether it is a sign."""
         return isinstance(self.answers[0], int)
 
-    @property
-    def sensed(self) -> bool:
-        """Whether it is a sign that a gyro speaks for."""
-        return self.of_sign and self.against == _TURNED
-
 
 def unit_words(reading: Reading, machine: Machine) -> tuple[str, ...]:
     """The units that a column without one in its name may have, the likeliest first."""
@@ -322,8 +314,7 @@ def questions(draft: Draft, machine: Machine) -> list[Question]:
             own = "both" if reading.shares else "command" if reading.commanded else "measured"
             groups.setdefault((own, scales), []).append(k)
         if len(reading.match.columns) == 1 and reading.match.target not in one_way:
-            against = _TURNED if reading.turning else _UNLIKELY
-            signs.append(Question((k,), (reading.sign, turned(reading.sign)), against))
+            signs.append(Question((k,), (reading.sign, turned(reading.sign))))
     usual = _FLOWN if machine.flies else _UNLIKELY
     units = [
         Question(tuple(members), scales, _CUSTOM if scales[0].ends else usual)
@@ -363,3 +354,9 @@ def answered(readings: Sequence[Reading], asked: Sequence[Question], answers: Se
         for k in question.readings:
             out[k] = out[k].turned_to(answer) if isinstance(answer, int) else out[k].read_as(answer)
     return tuple(out)
+
+
+def rounded_up(value: float) -> float:
+    """Upwards to two digits."""
+    digits = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return float(f"{np.ceil(value / digits) * digits:.2g}")

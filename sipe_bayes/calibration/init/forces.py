@@ -12,22 +12,19 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
+from sipe_bayes.calibration.init.cases import Source, case_of, loaded
 from sipe_bayes.calibration.init.columns.match import Match
 from sipe_bayes.calibration.init.columns.signals import Likeness
 from sipe_bayes.calibration.init.draft import Draft, Reading
 from sipe_bayes.calibration.init.machine import Machine
-from sipe_bayes.calibration.init.windows import FEW, Source, loaded, trial_of
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.core.units import find_unit, unit_words
-from sipe_bayes.likelihood import estimate_states
-from sipe_bayes.simulation.simulator import Simulator
 
 _FOLLOWS = 0.3  # share of variance from which a column is the force of a drive, whose gains may be off
 _UNSURE, _FAR = np.log(1.5), np.log(4.0)  # of the logarithm of how many times the model's force it is
-_SAMPLES, _FEWEST = 400, 20  # of each log, and of all
-_LATE = (0, 1, 2, 4, 8)  # samples, of the commands
+_FEWEST = 20  # rows
 
 
 def with_forces(
@@ -54,13 +51,19 @@ def with_forces(
         return draft, notes
     first = tuple(Reading(m, m.label.unit or _words(machine, m)[0]) for m in known)
     whole = replace(draft, measurements=(*draft.measurements, *first))
-    trial, layout = trial_of(whole, model, machine, loaded(whole, sources, folder), folder, FEW)
-    seen = [np.concatenate([_applied(trial.simulator, trial.theta, log, d) for log in trial.logs]) for d in _LATE]
-    measured = np.concatenate([_spread(log.observations[:-1]) for log in trial.logs])
+    regression = case_of(draft, model, machine, sources, folder).regression
+    motion, place = regression.given_motion, sum(len(m.channels) for m in draft.config(folder).measurements)
+    logs = [log.slice(0, len(own)) for log, own in zip(loaded(whole, sources, folder), regression.logs, strict=True)]
+    measured = np.concatenate(
+        [
+            gaussian_filter1d(log.observations[:, place:], width, axis=0)[rows]
+            for log, width, rows in zip(logs, regression.widths, regression.rows, strict=True)
+        ]
+    )
     readings = []
-    for k, reading in enumerate(first, len(draft.measurements)):
-        (channel,) = layout.channels[k]
-        like = max((_likeness(one[:, channel], measured[:, channel]) for one in seen), key=lambda one: one.share)
+    for k, reading in enumerate(first):
+        dof = int(model.joint(_joint(reading)).dofadr[0])
+        like = max((_likeness(one[:, dof].sum(-1), measured[:, k]) for one in motion.given), key=lambda one: one.share)
         decided = _decided(reading, like)
         if decided.fit:
             readings.append(decided)
@@ -85,8 +88,7 @@ def _decided(reading: Reading, like: Likeness) -> Reading:
         return find_unit(word).factor / (abs(like.factor) * own)
 
     unit = min(words, key=lambda word: abs(float(np.log(times(word)))))
-    joint = reading.match.target.removeprefix("joint:").removesuffix(".force")
-    note = f"the model's force at {joint} explains {100 * like.share:.0f} % of its variance"
+    note = f"the model's force at {_joint(reading)} explains {100 * like.share:.0f} % of its variance"
     off = abs(float(np.log(times(unit))))
     note += f"; in {unit} it is {times(unit):.2g} times as large" if like.share > _FOLLOWS else ""
     if like.share < _FOLLOWS or off > _FAR:
@@ -97,6 +99,10 @@ def _decided(reading: Reading, like: Likeness) -> Reading:
     return replace(reading, notes=(note,))
 
 
+def _joint(reading: Reading) -> str:
+    return reading.match.target.removeprefix("joint:").removesuffix(".force")
+
+
 def _likeness(simulated: FloatArray, measured: FloatArray) -> Likeness:
     """How one (n,) goes as the other; the factor is that of their spreads, which noise of either does not shrink."""
     known = np.isfinite(simulated) & np.isfinite(measured)
@@ -104,15 +110,3 @@ def _likeness(simulated: FloatArray, measured: FloatArray) -> Likeness:
         return Likeness(1.0, 0.0)
     alike = float(np.corrcoef(simulated[known], measured[known])[0, 1])
     return Likeness(float(np.sign(alike) * simulated[known].std() / measured[known].std()), alike**2)
-
-
-def _applied(simulator: Simulator, theta: FloatArray, log: Trajectory, late: int) -> FloatArray:
-    """The channels (n, C) of the model in the states of a log, with commands that arrive some samples late."""
-    states = _spread(estimate_states(simulator, log)[:-1])
-    actions = _spread(np.concatenate([np.repeat(log.actions[:1], late, axis=0), log.actions])[: len(log)])
-    return simulator.rollout(theta, actions[:, None], states, log.dt, allow_outside=True).observations[:, 0]
-
-
-def _spread(rows: FloatArray) -> FloatArray:
-    """Some of a log's rows (n, ...), evenly."""
-    return rows[:: 1 + len(rows) // _SAMPLES]

@@ -10,59 +10,54 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from sipe_bayes.calibration.init.absolute import absolute_angles, with_zeros
+from sipe_bayes.calibration.init.cases import Source, case_of, gyros_of, rough_unknowns, tried_part
 from sipe_bayes.calibration.init.columns.match import Match, Matches
 from sipe_bayes.calibration.init.columns.matching import match_columns
 from sipe_bayes.calibration.init.columns.names import pieces_of
 from sipe_bayes.calibration.init.columns.vocabulary import TURNS
-from sipe_bayes.calibration.init.decisions import decide
+from sipe_bayes.calibration.init.decisions import (
+    Case,
+    absolute_angles,
+    decide,
+    searched,
+    tied_of,
+    with_gyros,
+    with_units_of_names,
+    with_zeros,
+)
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading, Unknown
-from sipe_bayes.calibration.init.fits import delay_of, fit
 from sipe_bayes.calibration.init.forces import with_forces
-from sipe_bayes.calibration.init.kinematics.poses import with_pose_rates
-from sipe_bayes.calibration.init.kinematics.rates import rates_of, with_evidence_of, with_rates
-from sipe_bayes.calibration.init.machine import Machine, Sizes, touching_bodies
-from sipe_bayes.calibration.init.ranking import Case, ranked_of, under
+from sipe_bayes.calibration.init.machine import Drive, Machine, touching_bodies
+from sipe_bayes.calibration.init.oddities import oddities
 from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
+from sipe_bayes.calibration.init.regression import Outcome, Regression
 from sipe_bayes.calibration.init.tables import Opened, loads, richest
-from sipe_bayes.calibration.init.trials import Trial
+from sipe_bayes.calibration.init.unknowns.bounds import informed, sizes_of, started
 from sipe_bayes.calibration.init.unknowns.candidates import candidates, scale_is_open, springs
 from sipe_bayes.calibration.init.unknowns.choice import RELATIVE, chosen, roomy, sprung
 from sipe_bayes.calibration.init.unknowns.contacts import nameless
-from sipe_bayes.calibration.init.windows import (
-    FEW,
-    MANY,
-    SOME,
-    Source,
-    delays_of,
-    loaded,
-    rough_unknowns,
-    share_of,
-    trial_of,
-    tried_part,
-)
+from sipe_bayes.calibration.init.unknowns.effects import delay_of, fit_unknowns
 from sipe_bayes.calibration.readers.base import LogError
 from sipe_bayes.calibration.readers.many import episodes_of, matching
 from sipe_bayes.calibration.readers.numbered import starred
 from sipe_bayes.calibration.readers.tables import READERS, read_table
-from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 from sipe_bayes.envs.internal.closed_chains import dependent_joints
 from sipe_bayes.envs.internal.resting import resting_joints
 from sipe_bayes.envs.poses import has_pose, is_round
 from sipe_bayes.inference.recorded import Tell, silent
-from sipe_bayes.likelihood import StateSpace, default_likelihood, estimate_states
+from sipe_bayes.likelihood import StateSpace, default_likelihood
 
 _PASSED = 300  # states of each log, of which it is looked what they touch
-_LOOKED_AT = 3  # logs that are simulated
+_LOOKED_AT = 6  # logs
 _CHECKED = 60  # logs whose columns are looked at
 _HELD = 0.75  # share of a single log that trains
 _SINGLE, _COUPLED = 0.4, 0.2  # of the time in which the motion goes to and fro, windows of the fit
 _FLOWN = 0.1  # likewise of what thrust carries, which falls over soon
 _LARGEST_BIAS = {"accelerometer": 1.0, "gyro": 0.2}  # m/s^2, rad/s
 _BLIND = 0.5  # s, windows where nothing tells how fast the machine moves
-_TURNING = 24  # windows of the fit of what turns freely: contacts take their time
-_ROUNDS = 20  # of the fit of unknowns: with dry friction and a delay 12 end far from the optimum, at another delay
+_UNTOLD = 0.9  # of the forces, from which no unknown is told
+_UNFOLLOWED = 0.8  # of the forces of a joint, what is left where the model hardly explains them
 _SPARE = 3  # columns that are not used, of which names are told
 _SHORT = 2.0  # s: logs as short are one window each
 
@@ -102,7 +97,7 @@ def propose(
     )  # fmt: skip
     positions = bool(tried_part(draft).measurements)
     trained = (
-        _decided(draft, model, machine, sources, folder, matches.forces, tell)
+        _decided(draft, model, machine, sources, folder, matches.forces, opened, tell)
         if positions
         else _undecided(draft, model, machine)
     )
@@ -279,41 +274,47 @@ def _decided(
     sources: list[Source],
     folder: Path,
     forces: Sequence[Match],
+    opened: Opened,
     tell: Tell,
 ) -> Draft:
-    """Units, signs, delay, unknowns and the window's length, by simulations of the logs."""
+    """Units, signs, zeros, delay, unknowns and the window's length, by regressions of the logs."""
     draft = replace(draft, unknowns=tuple(rough_unknowns(model, machine, draft.readings)))
-    rates = rates_of(draft, model, machine, sources, folder)
-    draft = with_pose_rates(with_rates(draft, rates), model, machine, sources, folder)
-    part = tried_part(draft)
-    rest = tuple(r for r in draft.measurements if r not in part.measurements)
-    trial, layout = trial_of(part, model, machine, loaded(part, sources, folder), folder, FEW)
-    signs, zeros = (under(tell, phase) for phase in ("units and signs", "zeros of joints"))
-    case = Case(part, machine, trial, layout, trial.theta, signs)
-    ranking = ranked_of(case)
-    against_world = absolute_angles(case, model, ranking)
-    wide, _ = trial_of(part, model, machine, trial.logs, folder, SOME)
-    placed, unplaced = with_zeros(replace(case, trial=wide, theta=wide.theta, tell=zeros), model, ranking)
-    if placed != part:
-        moved, layout = trial_of(placed, model, machine, loaded(placed, sources, folder), folder, FEW)
-        case = Case(placed, machine, moved, layout, moved.theta, signs)
-        again = ranked_of(case)
-        left = absolute_angles(case, model, again)
-        if not (against_world and left):  # else it was no zero that made an angle look like one against the world
-            part, trial, against_world, ranking = placed, moved, left, again
-    part = decide(part, machine, trial, layout, ranking, signs)
-    part, unlike = with_forces(part, forces, model, machine, sources, folder)
-    logs = loaded(part, sources, folder)
-    last = under(tell, "delay and unknowns")
-    unknowns, delay, notes, lost = _unknowns(part, model, machine, logs, folder, last)
+    part, gyros = tried_part(draft), gyros_of(draft, machine)
+
+    def case(part: Draft) -> Case:
+        return case_of(part, model, machine, sources, folder, gyros, tell)
+
+    tell("units and signs")
+    search = searched(case(part))
+    against_world = absolute_angles(search, model)
+    decided, springs_act = decide(search), search.case.regression.springs
+    tell("zeros of joints")
+    placed = with_zeros(case(decided), model)
+    if (
+        placed != decided and against_world
+    ):  # it may have been a zero that made an angle look like one against the world
+        against_world = absolute_angles(searched(case(placed)), model)
+    there = case(placed)
+    read, turned = with_units_of_names(there, placed.readings), with_gyros(there, gyros)
+    done, unlike = with_forces(_read_with(placed, read), forces, model, machine, sources, folder)
+    tell("delay and unknowns")
+    last = case(done)
+    last.regression.springs = springs_act
+    unknowns, delay, notes, lost = _unknowns(last, model, sources, folder)
     unknowns, doubts = _some(unknowns)
-    window, why = _window(machine, logs, trial)
-    done = replace(
-        part, measurements=(*part.measurements, *rest), unknowns=tuple(unknowns), window=window, window_note=why,
+    window, why = _window(machine, last.regression)
+    rest = tuple(turned.get(r.match.target, r) for r in draft.measurements if r not in part.measurements)
+    odd = [one.text for one in oddities(there, opened)]
+    return replace(
+        done, measurements=(*done.measurements, *rest), unknowns=tuple(unknowns), window=window, window_note=why,
         notes=(*draft.notes, *unlike, *notes), delay=delay,
-        doubts=(*against_world, *unplaced, *part.doubts, *lost, *doubts),
+        doubts=(*odd, *against_world, *done.doubts, *lost, *doubts),
     )  # fmt: skip
-    return with_evidence_of(done, rates)
+
+
+def _read_with(draft: Draft, readings: Sequence[Reading]) -> Draft:
+    measured = len(draft.measurements)
+    return replace(draft, measurements=tuple(readings[:measured]), commands=tuple(readings[measured:]))
 
 
 def _undecided(draft: Draft, model: mujoco.MjModel, machine: Machine) -> Draft:
@@ -324,74 +325,84 @@ def _undecided(draft: Draft, model: mujoco.MjModel, machine: Machine) -> Draft:
 
 
 def _unknowns(
-    draft: Draft, model: mujoco.MjModel, machine: Machine, logs: Sequence[Trajectory], folder: Path, tell: Tell
+    case: Case, model: mujoco.MjModel, sources: Sequence[Source], folder: Path
 ) -> tuple[list[Unknown], float, list[str], list[str]]:
     """Parameters that these logs tell apart, the delay in samples, notes, and doubts of columns that nothing follows.
 
     Bounds are of the size of the motion.
     """
-    trial, _ = trial_of(draft, model, machine, logs, folder, FEW)
-    passed = [estimate_states(trial.simulator, log) for log in logs]
-    states = [own[starts] for own, starts in zip(passed, trial.places, strict=True)]
-    control, compiled = trial.simulator.environment.control, trial.simulator.model
-    controls = [
-        control(compiled, own, log.actions[starts]) for own, log, starts in zip(states, logs, trial.places, strict=True)
-    ]
-    sizes = Sizes.of(model, machine, np.concatenate(states), np.concatenate(controls))
-    touching = touching_bodies(model, np.concatenate([own[:: 1 + len(own) // _PASSED] for own in passed]))
+    draft, machine, regression = case.draft, case.machine, case.regression
+    logs, outcome = regression.logs, regression.fit(regression.given)
+    sizes = sizes_of(model, machine, regression, outcome)
+    passed = np.concatenate([own[:: 1 + len(own) // _PASSED] for own in regression.states])
+    touching = touching_bodies(model, passed)
     unknowns = candidates(model, machine, draft.readings, sizes, sorted(touching))
+    unknowns, values = informed(model, unknowns, regression, outcome)
     beside = springs(model, machine, draft.readings, sizes)
-    windows = _TURNING if trial.simulator.environment.rotations else MANY
-    trial, layout = trial_of(replace(draft, unknowns=(*unknowns, *beside)), model, machine, logs, folder, windows)
-    names = list(trial.simulator.space.names)
+    wide = case_of(replace(draft, unknowns=(*unknowns, *beside)), model, machine, sources, folder)
+    names = list(wide.regression.simulator.environment.space.names)
     unknowns = [unknown for unknown in unknowns if unknown.name in names]
+    told = outcome.miss[regression.known]
     actuators = [r.match.target.removeprefix("actuator:") for r in draft.commands]
-    left = fit(trial, trial.given, delays_of(trial, logs[0].dt), _ROUNDS, tell)
-    late, note = delay_of(actuators, left, logs[0].dt)
-    samples = left.finer if late else 0.0
-    given = trial.simulator.space.default_theta
-    shown, values = chosen(model, unknowns, left, given, scale_is_open(model, machine, draft.readings))
-    shown = [u if u.left_out else roomy(model, u, float(x)) for u, x in zip(shown, values, strict=False)]
+    own = np.clip(wide.regression.simulator.environment.space.default_theta, 0.0, 1.0)
+    left = fit_unknowns(wide.regression, outcome, started(names, unknowns, own, values))
+    late, note = delay_of(actuators, outcome, regression.independent(outcome), regression.delays, logs[0].dt)
+    shown, at = chosen(model, unknowns, left, own, scale_is_open(model, machine, draft.readings))
+    if len(told) and told.min() > _UNTOLD:
+        shown = [u if u.left_out else replace(u, left_out="the model explains nothing of these logs") for u in shown]
+    contacts = ("geom:", "pair:")  # of which forces without contacts tell nothing
+    shown = [replace(u, left_out="") if u.targets[0].startswith(contacts) else u for u in shown]
+    shown = [u if u.left_out else roomy(model, u, float(x)) for u, x in zip(shown, at, strict=False)]
     notes = [note] if note and not late else []
     notes += [*nameless(model, touching - {model.body(body).id for body in machine.bodies})]
-    lost = trial.unfollowed(replace(trial.given, delay=left.best), left.theta)
     doubts = [
-        f"nothing that is simulated follows {reading.match.column!r}: windows miss {lost[k]:.2g} times what going "
-        "on straight does; look at its zero, unit and sign, and at what the model lacks"
-        for reading, channels in zip(draft.measurements, layout.channels, strict=False)
-        for k in channels if k in lost
-    ]  # fmt: skip
-    asked, pulls = sprung(model, unknowns, beside, left, np.concatenate(passed))
-    return [*late, *shown, *asked], samples, notes, [*doubts, *pulls]
+        f"the model explains little of the forces that move {reading.match.column!r} ({100 * (1 - miss):.0f} %): "
+        "look at its zero, unit and sign, and at what the model lacks"
+        for reading, miss in _followed_badly(case, outcome)
+    ]
+    asked, pulls = sprung(model, unknowns, beside, left, passed)
+    return [*late, *shown, *asked], outcome.delay if late else 0.0, notes, [*doubts, *pulls]
+
+
+def _followed_badly(case: Case, outcome: Outcome) -> list[tuple[Reading, float]]:
+    """Readings of joints whose forces the model hardly explains, and the share that is left."""
+    model, out = case.regression.simulator.model, []
+    served = {case.draft.readings[place].match.target for place, _ in tied_of(case).values()}
+    for reading in case.draft.measurements:
+        if reading.match.target.startswith("joint:") and reading.match.target not in served:
+            dof = int(model.joint(reading.match.target[6:].rpartition(".")[0]).dofadr[0])
+            if case.regression.known[dof] and outcome.miss[dof] > _UNFOLLOWED:
+                out.append((reading, min(1.0, float(outcome.miss[dof]))))
+    return out
 
 
 def _some(unknowns: list[Unknown]) -> tuple[list[Unknown], list[str]]:
     """The unknowns, all of them asked for where the simulations told none apart, and what is said of that."""
     if any(not unknown.left_out for unknown in unknowns):
-        relative = [u for u in unknowns if u.left_out == RELATIVE]
-        doubts = [
-            f"no force is known: all forces and masses are relative to {u.name}, {u.note}; weigh it, correct the model"
-            for u in relative
-        ]
+        relative = [u.name for u in unknowns if u.left_out == RELATIVE]
+        said = f"no force is known, so that all forces are relative to the model's masses ({', '.join(relative)})"
+        doubts = [f"{said}: weigh one and correct the model"] * bool(relative)
         return unknowns, doubts
     if not unknowns:
         return [], ["nothing of the model could be proposed as unknown; add [[parameters]] by hand"]
-    doubt = "no unknown shows in the windows that were simulated, so all are asked for; look at the log and the model"
+    doubt = "no unknown shows in these logs, so all are asked for; look at the log and at the model"
     return [replace(unknown, left_out="") for unknown in unknowns], [doubt]
 
 
-def _window(machine: Machine, logs: Sequence[Trajectory], trial: Trial) -> tuple[float | str | None, str]:
+def _window(machine: Machine, regression: Regression) -> tuple[float | str | None, str]:
     """Length of the segments of the fit, a part of the time in which the motion goes to and fro: joints couple soon.
 
     At most a fifth of a log, so that its held-out quarter is longer. None where bodies strike: ``state_space``.
     """
-    if isinstance(default_likelihood(trial.simulator, logs), StateSpace):
+    logs = regression.logs
+    if isinstance(default_likelihood(regression.simulator, logs), StateSpace):
         return None, "bodies strike or slip along the logs"
     durations = [len(log) * log.dt for log in logs]
     if max(durations) <= _SHORT:
         return "log", "each log as one: they are short"
-    swing = trial.length * logs[0].dt / share_of(machine)
-    part = _COUPLED if len(machine.joints) > 1 and share_of(machine) < _COUPLED else _SINGLE
+    swing = regression.period * logs[0].dt
+    held = [a.drive in (Drive.POSITION, Drive.VELOCITY) for a in machine.actuators]
+    part = _COUPLED if len(machine.joints) > 1 and not (held and all(held)) else _SINGLE
     part = _FLOWN if machine.flies else part
     length = float(np.clip(part * swing, max(0.1, 20 * logs[0].dt), min(2.0, min(durations) / 5)))
     return float(f"{length:.2g}"), f"s; the motion goes to and fro in about {swing:.2g} s"

@@ -154,6 +154,14 @@ def _clock(path: Path, numbers: Mapping[str, FloatArray]) -> Clock:
         rank -= 4.0 * (step == 1.0 and not label.unit and word not in ("time", "t"))  # a counter of samples
         ranked[word] = max(ranked.get(word, -np.inf), rank)
     if not ranked:
+        for name, values in numbers.items():
+            repeats = np.flatnonzero(np.diff(values) == 0) if len(values) > 2 else np.zeros(0)
+            rises = read_name(leaf(name)).kind == Kind.TIME and bool((np.diff(values) >= 0).all())
+            if rises and 0 < len(repeats) < len(values) / 10:
+                raise LogError(
+                    f"{path}: {name!r} repeats a time stamp in {len(repeats)} rows, first in row {repeats[0] + 3}; "
+                    "leave these rows out"
+                )
         steady = [name for name, values in numbers.items() if _increases(values) and _is_steady(values)]
         if not steady:
             has = listed(list(map(repr, numbers)))

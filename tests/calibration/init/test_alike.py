@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.calibration.init.draft import Unknown
-from sipe_bayes.calibration.init.fits import Fit
 from sipe_bayes.calibration.init.unknowns.alike import shared, together
 from sipe_bayes.calibration.init.unknowns.choice import MOST, chosen
+from sipe_bayes.calibration.init.unknowns.effects import Fit
 
 LEGS = ("FL", "FR", "RL", "RR")
 
@@ -66,7 +66,7 @@ def test_what_one_parameter_does_is_what_all_of_them_do() -> None:
         unknown("FR_hip_damping", "joint:FR_hip.damping", 2.0),
     ]
     jacobian = np.random.default_rng(0).standard_normal((50, 3))  # and of what stands behind them
-    fit = Fit((0,), np.ones(1), np.array([0.4, 0.1, 0.9]), jacobian, np.ones(1))
+    fit = Fit(np.array([0.4, 0.1, 0.9]), np.ones(3), jacobian)
     (one,), after, own = together(unknowns, fit, np.array([0.2, 0.1, 0.0]), [[0, 1]], "damping")
     assert (one.name, one.low, one.high) == ("hip_damping", 0.0, 2.0)
     assert one.targets == ("joint:FL_hip.damping", "joint:FR_hip.damping")
@@ -83,7 +83,7 @@ def test_only_as_many_share_as_is_needed() -> None:
         unknowns = [unknown(f"{j}_kp", f"actuator:{j}.kp", relative=True) for j in joints]
         unknowns += [unknown(f"{j}_{field}", f"joint:{j}.{field}") for j in joints for field in fields]
         n = len(unknowns)
-        fit = Fit((0,), np.ones(1), np.full(n, 0.5), 100 * rng.standard_normal((400, n)), np.ones(1))
+        fit = Fit(np.full(n, 0.5), np.ones(n), 100 * rng.standard_normal((400, n)))
         left, values = chosen(model, unknowns, fit, np.zeros(n), False)
         assert len(values) == len(left)
         return [u.name for u in left if not u.left_out]

@@ -66,12 +66,12 @@ def test_what_is_attached_is_offered(tmp_path: Path) -> None:
     assert not [doubt for doubt in draft.doubts if "no force is known" in doubt]
 
 
-def test_without_a_known_force_the_mass_that_shows_most_is_the_scale(tmp_path: Path) -> None:
+def test_without_a_known_force_the_masses_are_the_scale(tmp_path: Path) -> None:
     _arm_log(tmp_path, "duty")
     draft = propose(tmp_path / "arm.xml", [tmp_path / "log.csv"], tmp_path)
     asked = {unknown.name for unknown in draft.proposed}
     left = [u.name for u in draft.unknowns if u.name.endswith("_mass") and "no force is known" in u.left_out]
-    assert len(left) == 1
+    assert left == ["upper_mass", "lower_mass", "tool_mass"]
     assert {"shoulder_gain", "elbow_gain"} <= asked
     assert any("no force is known" in doubt and left[0] in doubt for doubt in draft.doubts)
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import mujoco
-import numpy as np
 import pytest
 
-from sipe_bayes.calibration.init import fits
+from sipe_bayes.calibration.init.cases import rough_unknowns
 from sipe_bayes.calibration.init.columns.match import Match
 from sipe_bayes.calibration.init.columns.names import read_name
 from sipe_bayes.calibration.init.draft import Reading
 from sipe_bayes.calibration.init.machine import Machine, base_joints, bases
-from sipe_bayes.calibration.init.windows import rough_unknowns
 
 WHEEL = '<body name="wheel"><joint name="roll"/><geom size=".05" mass=".1"/></body>'
 ARM = '<body name="arm"><joint name="swing" damping=".1"/><geom size=".05" mass=".1"/></body>'
@@ -66,15 +64,3 @@ def test_what_is_asked_of_a_base() -> None:
     assert not [name for name in asked if name.startswith(("x_", "y_", "yaw_"))]
     assert {f"base_{what}_{axis}" for what in ("com", "inertia") for axis in "xyz"} <= {*asked}
     assert all(asked[f"base_com_{axis}"].low < 0 < asked[f"base_com_{axis}"].high for axis in "xyz")
-
-
-def test_slopes_are_those_of_the_best_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A last step that went too far leaves differences that say nothing, and slopes that are zero."""
-    good = fits._Slopes(np.ones((1, 2, 3)), np.ones((1, 2, 3)), np.zeros((2, 3, 1)), np.ones(1))
-    far = fits._Slopes(np.full((1, 2, 3), 1e6), np.zeros((1, 2, 3)), np.zeros((2, 3, 1)), np.ones(1))
-    steps = iter([good, far])
-    monkeypatch.setattr(fits, "_slopes", lambda *_: next(steps))
-    begun = {0: fits._Point(np.full(1, 0.5), np.zeros((2, 1)))}
-    points, slopes, best = fits._descended(None, None, begun, 0, 2, lambda _: None)  # type: ignore[arg-type]
-    assert (slopes is good, best) == (True, 0)
-    np.testing.assert_array_equal(points[0].theta, 0.5)

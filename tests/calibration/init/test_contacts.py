@@ -8,12 +8,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from sipe_bayes.calibration.init.cases import rough_unknowns
 from sipe_bayes.calibration.init.draft import Unknown
 from sipe_bayes.calibration.init.machine import Machine
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.unknowns.candidates import as_parameters
 from sipe_bayes.calibration.init.unknowns.contacts import nameless
-from sipe_bayes.calibration.init.windows import rough_unknowns
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import bind
@@ -146,7 +146,7 @@ def test_bounds_hold_the_friction_that_the_model_has() -> None:
     assert castor.low <= 0.01
 
 
-@pytest.mark.parametrize(("gap", "whole"), [(0.04, False), (0.6, True)])
+@pytest.mark.parametrize(("gap", "whole"), [(0.04, False), (0.8, True)])
 def test_few_short_logs_through_impacts_are_cut(gap: float, whole: bool, tmp_path: Path) -> None:
     """Their scatter is of eight windows at least; logs without impacts stay whole."""
     model = tmp_path / "model.xml"

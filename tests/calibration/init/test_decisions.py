@@ -1,12 +1,11 @@
-"""What is said of readings that simulations do not tell."""
+"""What is said of readings that logs do not tell."""
 
 from __future__ import annotations
 
 from sipe_bayes.calibration.init.columns.match import SURE, Match
 from sipe_bayes.calibration.init.columns.names import read_name
-from sipe_bayes.calibration.init.decisions import _by_names
-from sipe_bayes.calibration.init.draft import Draft, Reading, Scale
-from sipe_bayes.calibration.init.tables import Clock
+from sipe_bayes.calibration.init.decisions import guessed
+from sipe_bayes.calibration.init.draft import Reading, Scale
 
 
 def counting(column: str, turn: int) -> Reading:
@@ -19,6 +18,5 @@ def test_counts_that_nothing_tells_are_open_by_their_number() -> None:
     """Of 49 the inverse of the inverse is another number; a column that counts nothing is not named."""
     plain = Reading(Match(("pitch_deg",), "joint:pitch.position", read_name("pitch_deg"), SURE), "deg")
     wheels = counting("left", 49), counting("right", 49), counting("boom", 4096), plain
-    draft = _by_names(Draft("model.xml", Clock("time", "s", 0.01, ""), None, (), wheels, (), 1.0), [])
-    guesses = [doubt.split(" counts")[0] for doubt in draft.doubts if "is a guess" in doubt]
+    guesses = [doubt.split(" counts")[0] for doubt in guessed(wheels)]
     assert guesses == ["'left', 'right': 49", "'boom': 4096"]

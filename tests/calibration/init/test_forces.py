@@ -60,7 +60,7 @@ def test_efforts_are_measured_with_their_sign_and_unit_and_make_forces_known(tmp
     [
         ({"shoulder": 40.0, "elbow": 40.0}, "effort_{}", "times as large"),  # shares of a largest, or counts
         ({"shoulder": 2.0, "elbow": 2.0}, "effort_{}_A", "A is no unit of a force"),
-        ({"shoulder": 0.0, "elbow": 0.0}, "tau_measured_{}", "explains 1 % of"),  # noise
+        ({"shoulder": 0.0, "elbow": 0.0}, "tau_measured_{}", "% of its variance"),  # noise
         ({"shoulder": 1.0, "elbow": 1.0}, "torque_cmd_{}", "not used: torque_cmd_shoulder, torque_cmd_elbow"),
     ],
 )

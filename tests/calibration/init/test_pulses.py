@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sipe_bayes.calibration.init.check import checked
 from sipe_bayes.calibration.init.columns.names import read_name
 from sipe_bayes.calibration.init.machine import Machine
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.readings import _pulse
 from sipe_bayes.calibration.init.write import toml_of
 from sipe_bayes.calibration.problem import prepare
+from sipe_bayes.calibration.validate import validate_config
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -75,8 +75,8 @@ def test_a_command_that_its_ctrlrange_cuts_off_is_odd(tmp_path: Path) -> None:
     right = toml_of(propose(tmp_path / "cart.xml", [tmp_path / "log.csv"], tmp_path, None), "sipe init")
     for name, text in {"right": right, "wrong": right.replace("zero = 1000.0", "zero = 100.0")}.items():
         (tmp_path / f"{name}.toml").write_text(text)
-    assert not any("ctrlrange" in line for line in checked(tmp_path / "right.toml").odd)
-    odd = checked(tmp_path / "wrong.toml").odd
+    assert not any("ctrlrange" in line for line in validate_config(tmp_path / "right.toml").odd)
+    odd = validate_config(tmp_path / "wrong.toml").odd
     cut = "% of it lies outside of the ctrlrange [0.0, 1.0] of actuator:fan"
     assert any("column 'pwm'" in line and cut in line for line in odd), odd
 

@@ -7,15 +7,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pandas as pd
-import pytest
 
 from sipe_bayes.calibration.init.decisions import missing_more
 from sipe_bayes.calibration.init.draft import Draft, Reading, Scale
-from sipe_bayes.calibration.init.kinematics.gyros import Gyro, hinges_of
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.write import toml_of
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.trajectory import Trajectory
 
 BOOM = """<mujoco><option timestep="0.002" integrator="implicitfast" gravity="0 0 {gravity}"/><worldbody>
   <body name="mast">
@@ -76,13 +73,10 @@ def test_a_gyro_tells_counts_and_signs(tmp_path: Path) -> None:
     for column, sign in (("slew_enc", 1), ("luff_enc", -1)):
         reading = by_column(draft)[column]
         assert (reading.unit, round(1 / reading.factor), reading.sign) == ("rev", 20000, sign), reading
-        counts = [
-            float(n.split()[-1]) for n in reading.notes if n.startswith("20000 counts a rev: the rates of 'gyro_x'")
-        ]
-        assert counts == [pytest.approx(20000 / 1.02, rel=0.01)], reading
-        assert any(f"sign {sign}: a gyro turns with it" in note for note in reading.notes), reading
+        assert any("20000 counts a rev" in text for text in (*reading.notes, *reading.doubts)), reading
+        assert any(f"sign {sign}: turned round" in note for note in reading.notes), reading
     assert by_column(draft)["luff_cmd_rad_s"].sign == 1
-    assert not [d for d in draft.open_doubts if "enc" in d and ("counts" in d or "sign" in d or "turned" in d)]
+    assert not [d for d in draft.open_doubts if "enc" in d and ("sign" in d or "turned" in d)]
 
 
 def test_a_gyro_in_degrees_that_no_name_tells(tmp_path: Path) -> None:
@@ -93,7 +87,7 @@ def test_a_gyro_in_degrees_that_no_name_tells(tmp_path: Path) -> None:
     readings = by_column(draft)
     assert readings["gyro_x"].unit == "deg/s", readings["gyro_x"]
     assert round(1 / readings["slew_enc"].factor) == 4096
-    doubt = "'slew_enc': 4096 counts a rev or 4000? the rates of 'gyro_x' say 4100, and a gyro may be off by 5 %"
+    doubt = "'slew_enc': 4096 counts a rev or 4000? the model explains the log as well with either"
     assert doubt in draft.open_doubts, draft.open_doubts
     assert "# factor = 0.00025" in toml_of(draft, "sipe init")
 
@@ -108,13 +102,12 @@ def test_degrees_or_radians_of_both_are_left_to_simulations(tmp_path: Path) -> N
     assert (readings["luff"].sign, readings["slew"].sign) == (1, 1)
 
 
-def test_counts_that_nobody_uses_are_measured(tmp_path: Path) -> None:
+def test_counts_that_nobody_uses_are_told(tmp_path: Path) -> None:
     """Behind a gear of 7."""
     columns = counted(moved(0.0), 28672, 28672)
     felt(columns, 1.0)
-    reading = by_column(proposed(tmp_path, columns))["slew_enc"]
-    assert 1 / reading.factor == pytest.approx(28672, rel=5e-3), reading
-    assert any("no usual number" in doubt for doubt in reading.doubts), reading
+    draft = proposed(tmp_path, columns)
+    assert any("look at" in doubt or "how is it mounted?" in doubt for doubt in draft.open_doubts), draft.open_doubts
 
 
 def test_without_a_gyro_simulations_alone_tell(tmp_path: Path) -> None:
@@ -129,40 +122,14 @@ def test_a_gyro_that_is_mounted_otherwise_does_not_decide_against_gravity(tmp_pa
     draft = proposed(tmp_path, columns, gravity=-9.81)
     reading = by_column(draft)["luff"]
     assert (reading.unit, reading.sign) == ("rad", 1), reading
-    assert any("speak for sign -1, simulations against it" in doubt for doubt in reading.doubts), reading
-
-
-@pytest.mark.parametrize("late", [0, 3])
-@pytest.mark.parametrize("zero", [0.0, 0.4])
-def test_factors_of_hinges_by_kinematics(late: int, zero: float) -> None:
-    """Whatever the zero of the hinge that turns the other's axis, and where the gyro is late."""
-    model = mujoco.MjModel.from_xml_string(BOOM.format(gravity=0.0, sensor=SENSOR))
-    columns, factors = moved(0.0), np.array([-0.3, 1.7])
-    hinges = hinges_of(model, "gyro")
-    assert hinges == [1, 0]
-    positions = np.stack([(columns["luff"] + zero) / factors[0], columns["slew"] / factors[1]], axis=1)
-    rates = np.roll(np.stack([columns[f"gyro_{axis}"] for axis in "xyz"], axis=1), late, axis=0)
-    log = Trajectory(np.concatenate([positions, rates], axis=1)[late:], np.zeros((len(rates) - late - 1, 0)), DT)
-    turned = Gyro(model, "gyro", hinges, [log]).turned([np.full(2, size) for size in (0.02, 0.3, 1.0)])
-    np.testing.assert_allclose(turned.factors, factors, rtol=0.01)
-    assert turned.zeros[0] == pytest.approx(zero, abs=0.02)
-    assert turned.share > 0.995
-    assert (turned.errors < 0.01).all(), turned.errors
-
-
-def test_a_gyro_on_what_moves_freely_tells_nothing_of_hinges() -> None:
-    model = mujoco.MjModel.from_xml_string(
-        '<mujoco><worldbody><body><freejoint/><geom size=".1"/><body><joint/><geom size=".1"/><site name="s"/>'
-        '</body></body></worldbody><sensor><gyro name="g" site="s"/></sensor></mujoco>'
-    )
-    assert hinges_of(model, "g") is None
+    assert any("how is it mounted?" in doubt for doubt in draft.open_doubts), draft.open_doubts
 
 
 def test_units_that_many_others_miss_more_than_are_one_line() -> None:
     one, answer = [(Scale("deg"), 12.34)], Scale("rev", 1 / 4096)
     many = [(Scale("rev", 1 / count), times) for count, times in ((1024, 2.41), (2048, 25.4), (360, 3.0), (400, 9.0))]
-    assert missing_more(Scale("rad"), one) == "rad: read as deg, simulated windows miss 12 times as much"
-    words = "4096 counts a rev: with 4 other usual counts a rev, simulated windows miss 2.4 to 25 times as much"
+    assert missing_more(Scale("rad"), one) == "rad: read as deg, 12 times as much of the joints' forces is left"
+    words = "4096 counts a rev: with 4 other usual counts a rev, 2.4 to 25 times as much of the joints' forces is left"
     assert missing_more(answer, many) == words
 
 
@@ -178,4 +145,3 @@ def test_what_is_being_done_is_told(tmp_path: Path) -> None:
         "zeros of joints",
         "delay and unknowns",
     ]
-    assert len({*lines}) > 2 * len({*headings})  # how far each is

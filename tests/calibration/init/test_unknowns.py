@@ -10,12 +10,13 @@ from sipe_bayes.calibration.init.columns.match import Match
 from sipe_bayes.calibration.init.columns.matching import match_columns
 from sipe_bayes.calibration.init.columns.names import read_name
 from sipe_bayes.calibration.init.draft import Reading, Unknown
-from sipe_bayes.calibration.init.fits import Fit, delay_of
 from sipe_bayes.calibration.init.machine import Machine, Sizes
 from sipe_bayes.calibration.init.readings import first_readings
+from sipe_bayes.calibration.init.regression import Outcome
 from sipe_bayes.calibration.init.tables import Clock
 from sipe_bayes.calibration.init.unknowns.candidates import candidates, least_of, springs
 from sipe_bayes.calibration.init.unknowns.choice import roomy, sprung, told_apart
+from sipe_bayes.calibration.init.unknowns.effects import Fit, delay_of
 
 
 @pytest.mark.parametrize(
@@ -40,7 +41,7 @@ def test_what_is_nearly_the_same_is_asked_for_where_the_logs_tell_it(
     basis = np.linalg.qr(rng.standard_normal((400, 2)))[0]
     both = np.stack([500 * basis[:, 0], size * (np.sqrt(1 - share**2) * basis[:, 0] + share * basis[:, 1])], axis=1)
     unknowns = [Unknown(name, (), 0.0, 1.0, False, "") for name in ("damping", "friction")]
-    fit = Fit((0,), np.ones(1), np.full(2, 0.5), both, np.ones(1))
+    fit = Fit(np.full(2, 0.5), np.ones(2), both)
     first, second = told_apart(unknowns, fit, np.full(2, 0.5 - away))
     assert not first.left_out
     assert (not second.left_out) is kept, second.left_out
@@ -73,37 +74,40 @@ def test_bounds_that_a_fit_presses_against_are_widened(
     assert ("wider" in kept.note) is (wider != bounds)
 
 
-@pytest.mark.parametrize(("miss", "asked"), [([1.4, 1.1, 1.0, 1.2], True), ([1.5, 1.04, 1.02, 1.0], False)])
-def test_a_delay_at_the_end_of_those_tried_is_none(miss: list[float], asked: bool) -> None:
+def outcome(*behind: float) -> Outcome:
+    """Of delays that leave so much more than the best: logarithms."""
+    none, costs = np.zeros(1), np.array(behind)
+    delay = float(np.argmin(costs))
+    return Outcome(none, none, none, none, none, delay, costs - costs.min(), 0.0, 0.0, np.zeros((1, 1)), none)
+
+
+@pytest.mark.parametrize(("behind", "asked"), [([0.34, 0.1, 0.0, 0.18], True), ([0.4, 0.04, 0.02, 0.0], False)])
+def test_a_delay_at_the_end_of_those_tried_is_none(behind: list[float], asked: bool) -> None:
     """A force that the model lacks is met the better the later commands come."""
-    fit = Fit((0, 14, 15, 16), np.array(miss), np.zeros(0), np.zeros((400, 0)), np.ones(1))
-    unknowns, note = delay_of(["motor"], fit, 0.005)
+    unknowns, note = delay_of(["motor"], outcome(*behind), 100.0, (0, 14, 15, 16), 0.005)
     assert bool(unknowns) is asked
     assert ("none is asked for" in note) is not asked
 
 
 def test_the_bounds_of_a_delay_hold_it_and_none_at_all() -> None:
     """None is what the model has, and a configuration without it in the bounds does not load."""
-    fit = Fit((0, 9, 10, 11), np.array([1.6, 1.1, 1.0, 1.1]), np.zeros(0), np.zeros((400, 0)), np.ones(1))
-    (delay,), _ = delay_of(["motor"], fit, 0.002)
+    (delay,), _ = delay_of(["motor"], outcome(0.5, 0.1, 0.0, 0.1), 100.0, (0, 9, 10, 11), 0.002)
     assert delay.low == 0
     assert delay.high > 0.022
 
 
-@pytest.mark.parametrize(("times", "clear"), [(1.03, False), (1.3, True)])
-def test_a_delay_that_explains_little_is_called_uncertain(times: float, clear: bool) -> None:
-    fit = Fit((0, 3, 4, 5), np.array([times, 1.01, 1.0, 1.01]), np.zeros(0), np.zeros((400, 0)), np.ones(1))
-    (delay,), note = delay_of(["motor"], fit, 0.01)
-    assert delay.note == note
-    assert ("uncertain, for it explains 3 % of what simulations miss" in note) is not clear
-    assert note.startswith("commands arrive about 40 ms late" if clear else "commands may arrive about 40 ms late")
+@pytest.mark.parametrize(("behind", "asked"), [(0.01, False), (0.3, True)])
+def test_a_delay_that_explains_too_little_is_not_asked_for(behind: float, asked: bool) -> None:
+    unknowns, note = delay_of(["motor"], outcome(behind, 0.005, 0.0, 0.01), 100.0, (0, 3, 4, 5), 0.01)
+    assert bool(unknowns) is asked
+    assert ("would not explain more" in note) is not asked
 
 
 @pytest.mark.parametrize(("size", "theta", "shown"), [(600.0, 0.5, True), (600.0, 0.01, False), (5.0, 0.5, False)])
 def test_a_spring_is_asked_for_where_one_shows(size: float, theta: float, shown: bool) -> None:
     """Of 4 N m/rad at most: with what it is about, and where it rests between the ends of the motion."""
     basis = np.linalg.qr(np.random.default_rng(0).standard_normal((400, 2)))[0]
-    fit = Fit((0,), np.ones(1), np.array([0.5, theta]), basis * [500.0, size], np.ones(1))
+    fit = Fit(np.array([0.5, theta]), np.ones(2), basis * [500.0, size])
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><body name="arm"><joint name="j"/><geom size=".1"/></body></worldbody></mujoco>'
     )

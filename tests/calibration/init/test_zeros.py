@@ -93,7 +93,7 @@ def test_the_zero_of_an_encoder_is_asked_for_where_simulations_alone_tell_it(tmp
     draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
     (reading,) = draft.measurements
     assert abs(reading.zero - zero) < reading.unsure, (reading.zero, reading.unsure)
-    assert any("which simulations alone tell" in doubt for doubt in draft.open_doubts)
+    assert any("which these logs alone tell" in doubt for doubt in draft.open_doubts)
     assert "hinge_rad_zero" in {unknown.name for unknown in draft.proposed}
     (tmp_path / "calibrate.toml").write_text(toml_of(draft, "sipe init"))
     problem = prepare(tmp_path / "calibrate.toml", 1)

@@ -11,7 +11,7 @@ import numpy as np
 from sipe_bayes.calibration.init.columns.names import pieces_of
 from sipe_bayes.calibration.init.columns.vocabulary import SIDES
 from sipe_bayes.calibration.init.draft import Unknown
-from sipe_bayes.calibration.init.fits import Fit
+from sipe_bayes.calibration.init.unknowns.effects import Fit
 from sipe_bayes.core.arrays import FloatArray
 
 SHARED = ("armature", "damping", "frictionloss", "stiffness", "lag", "bias_velocity", "kv", "gain", "kp", "mass")

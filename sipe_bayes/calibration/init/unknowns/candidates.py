@@ -53,6 +53,10 @@ def candidates(
     masses, attached = _masses(model, [*behind, *free])
     of_joints = of_tendons(model, [a for a, _ in driven], sizes) if joints else []
     of_joints += [u for joint in joints if not joint.base for u in of_joint(model, joint, sizes)]
+    damped = {f"joint:{a.joint.name}.damping" for a, _ in driven if a.joint is not None and _feeds_back(model, a)}
+    of_joints = [
+        unknown for unknown in of_joints if unknown.targets[0] not in damped
+    ]  # the gain of a speed is the same
     rotors = {actuator.joint for actuator in machine.actuators}
     of_joints += [u for joint in passive for u in of_joint(model, joint, sizes, rotor=joint in rotors)]
     if open_scale and len(joints) < 2:  # a rotor is so much more mass, to which the gain is relative
@@ -64,6 +68,13 @@ def candidates(
     carrying = bases(model) - {*flown} if driven and not attached else ()
     proposed += [unknown for body in carrying for unknown in _of_base(model, body)]
     return proposed or _masses(model, bodies)[0]
+
+
+def _feeds_back(model: mujoco.MjModel, actuator: Actuator) -> bool:
+    """Whether a gain of the velocity is asked for."""
+    index = model.actuator(actuator.name).id
+    fixed = int(model.actuator_gaintype[index]) == int(mujoco.mjtGain.mjGAIN_FIXED)
+    return fixed and actuator.drive != Drive.FORCE and bool(model.actuator_biasprm[index, 2])
 
 
 def _follow(model: mujoco.MjModel, machine: Machine, joints: Sequence[Joint]) -> list[Joint]:
@@ -133,6 +144,8 @@ def springs(model: mujoco.MjModel, machine: Machine, readings: Sequence[Reading]
     measured = {r.match.target for r in readings if not r.commanded}
     joints = [j for j in machine.joints if f"joint:{j.name}.position" in measured and not j.base]
     joints += _follow(model, machine, joints)
+    held = {a.joint for a in machine.actuators if a.drive == Drive.POSITION}  # a spring shows as the gain does
+    joints = [joint for joint in joints if joint not in held]
     soft = [j for j in joints if not float(np.ravel(model.joint(j.name).stiffness)[0])]
     return [
         Unknown(

@@ -8,13 +8,13 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from sipe_bayes.calibration.init.draft import Unknown
-from sipe_bayes.calibration.init.fits import Fit, rounded_up
+from sipe_bayes.calibration.init.draft import Unknown, rounded_up
 from sipe_bayes.calibration.init.unknowns.alike import SHARED, shared, together
 from sipe_bayes.calibration.init.unknowns.candidates import least_of
+from sipe_bayes.calibration.init.unknowns.effects import Fit
 from sipe_bayes.core.arrays import FloatArray
 
-RELATIVE = "no force is known, so that all others are relative to it; weigh it and write it into the model"
+RELATIVE = "no force is known, so that all forces are relative to it; weigh it and write it into the model"
 """Why a mass is left out."""
 _NOTABLE = 0.03  # of its range, from which a spring is asked for
 _STILL = 0.1  # rad or m, the least motion within which one may rest
@@ -56,13 +56,11 @@ def told_apart(
         unknowns: of the fit, those first that are to be kept first.
         fit: with the effects of each.
         given: (N,) of the model.
-        open_scale: whether forces and masses are known relative to each other alone: the mass that shows most is left
-            out, to which the others then are.
+        open_scale: whether forces and masses are known relative to each other alone: masses are left out then.
         most: of how many no more are asked for.
     """
-    sizes = np.linalg.norm(fit.jacobian, axis=0)
     masses = [k for k, unknown in enumerate(unknowns) if any(t.endswith(".mass") for t in unknown.targets)]
-    scale = max(masses, key=lambda k: float(sizes[k])) if masses and open_scale else None
+    scale = masses if open_scale and len(masses) < len(unknowns) else []
     kept: list[int] = []
     out = []
     effects = fit.jacobian / np.sqrt(max(1.0, len(fit.jacobian) / 400.0))  # residuals are correlated
@@ -70,7 +68,7 @@ def told_apart(
         effect = effects[:, k]
         size = float(np.linalg.norm(effect))
         reason = ""
-        if k == scale:
+        if k in scale:
             reason = RELATIVE
         elif size < _WEAK:
             reason = "moves too little in these logs"

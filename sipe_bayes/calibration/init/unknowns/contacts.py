@@ -8,8 +8,7 @@ from itertools import takewhile
 
 import mujoco
 
-from sipe_bayes.calibration.init.draft import Unknown
-from sipe_bayes.calibration.init.fits import rounded_up
+from sipe_bayes.calibration.init.draft import Unknown, rounded_up
 from sipe_bayes.calibration.init.machine import counts, friction_of, own_friction, top_of, touched_by
 
 _SLIPPERY = 0.02  # the least friction

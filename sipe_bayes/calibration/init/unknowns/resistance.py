@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from sipe_bayes.calibration.init.draft import Unknown
-from sipe_bayes.calibration.init.fits import rounded_up
+from sipe_bayes.calibration.init.draft import Unknown, rounded_up
 from sipe_bayes.calibration.init.machine import Actuator, Joint, Sizes
 from sipe_bayes.calibration.init.unknowns.contacts import word_of
 

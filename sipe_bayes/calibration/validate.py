@@ -1,10 +1,9 @@
-"""What is odd in a configuration that exists: units, signs, swapped columns, delays, velocities, angles that wrap."""
+"""What is odd in a configuration that exists and in its logs, before a fit."""
 
 from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,47 +12,37 @@ import numpy as np
 from sipe_bayes.calibration.config import Config, load_config
 from sipe_bayes.calibration.config_tables import Command, Measurement
 from sipe_bayes.calibration.gathered import no_rigid_bodies
+from sipe_bayes.calibration.init.cases import Source, case_of, rough_unknowns, tried_part
 from sipe_bayes.calibration.init.columns.match import Match
 from sipe_bayes.calibration.init.columns.names import read_name
 from sipe_bayes.calibration.init.columns.signals import turn_of
-from sipe_bayes.calibration.init.decisions import AGAINST, decide
+from sipe_bayes.calibration.init.decisions import DECIDED, Case, Search, decide, searched
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading
-from sipe_bayes.calibration.init.fits import delay_of, fit
-from sipe_bayes.calibration.init.machine import Machine, Sizes
-from sipe_bayes.calibration.init.ranking import fitted_miss
+from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.oddities import oddities
 from sipe_bayes.calibration.init.readings import with_velocities
+from sipe_bayes.calibration.init.regression import Regression
 from sipe_bayes.calibration.init.tables import Opened, open_table
-from sipe_bayes.calibration.init.trials import Assumption, Trial, followed
-from sipe_bayes.calibration.init.unknowns.candidates import springs
-from sipe_bayes.calibration.init.windows import (
-    FEW,
-    MANY,
-    Source,
-    delays_of,
-    loaded,
-    rough_unknowns,
-    trial_of,
-    tried_part,
-)
+from sipe_bayes.calibration.init.unknowns.effects import delay_of
 from sipe_bayes.calibration.problem import environment_of
 from sipe_bayes.calibration.readers.tables import read_table
 from sipe_bayes.core.finding_advice import ADVICE
+from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.core.units import find_unit
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 from sipe_bayes.posterior import prior
 
-_LOGS = 3  # that are simulated
-_BETTER = np.log(1.5)  # of the logarithm of misses together, from which another reading is named
+_LOGS = 3  # that are looked at
+_BETTER = 2 * DECIDED  # nats, from which another reading is named
 _ROOM = 0.05  # of a ctrlrange, by which a command may lie beyond it
-_ROUNDS = 12  # of the fits with either reading: a model that is far off speaks for wrong units
 
 
 @dataclass(frozen=True)
-class Checked:
+class Validated:
     """What was found in a configuration.
 
     Args:
-        odd: one line for each thing that simulations and slopes speak against.
+        odd: one line for each thing that the logs speak against.
         doubts: one line for each that they can not tell.
     """
 
@@ -61,7 +50,7 @@ class Checked:
     doubts: list[str]
 
 
-def checked(path: Path) -> Checked:
+def validate_config(path: Path) -> Validated:
     """Hold a configuration against its logs.
 
     Raises:
@@ -81,36 +70,32 @@ def checked(path: Path) -> Checked:
     part = tried_part(draft)
     part = replace(part, unknowns=tuple(rough_unknowns(model, machine, draft.readings)))
     sources = [Source(log.file, log.episodes[0] if log.episodes else None, log.span) for log in train]
-    logs = loaded(part, sources, folder)
-    trial, layout = trial_of(part, model, machine, logs, folder, FEW)
-    better = decide(part, machine, trial, layout)
-    gain, out = _swapped(part, trial)
-    changed = [
-        (a, b) for a, b in zip(part.readings, better.readings, strict=True) if (a.unit, a.sign) != (b.unit, b.sign)
-    ]
-    if changed:
-        then = layout.assumption(trial, part, better.readings)
-        (now, _), (other, _) = (fitted_miss(trial, assumption, _ROUNDS) for assumption in (trial.given, then))
-        named = all(a.sign == b.sign and read_name(a.match.column).unit == a.unit for a, b in changed)
-        if now - other > max(gain, AGAINST if named else _BETTER):
-            out = _other_readings(changed, np.exp((now - other) / len(part.measurements)))
+    case = case_of(part, model, machine, sources, folder)
+    search = searched(case)
+    better = decide(search)
+    out = [f"parameters: {one.text}. {ADVICE[one.code]}" for one in bodies]
+    out += _other_readings(search, part, better)
+    out = out or _swapped(case)
+    out += [one.text for one in oddities(case, opened)]
     if not out:
-        beside = springs(model, machine, draft.readings, Sizes.of(model, machine, None, None))
-        part = replace(part, unknowns=(*part.unknowns, *beside))
-        trial, _ = trial_of(part, model, machine, logs, folder, MANY)
-        left = fit(trial, trial.given, delays_of(trial, logs[0].dt), rounds=6)
-        late, note = delay_of([c.actuator for c in config.commands], left, logs[0].dt)
-        delays = [p for p in config.parameters if any(t.endswith(".delay") for t in p.targets)]
-        if late and not delays and not model.actuator_delay.any():
-            targets = ", ".join(f"actuator:{command.actuator}.delay" for command in config.commands)
-            out.append(f"parameters: {note}; ask for {'one of ' * (len(config.commands) > 1)}{targets}")
-        if late and delays and left.best * logs[0].dt > max(p.range[1] for p in delays):
-            out.append(f"parameters: {note}, beyond the bounds of {delays[0].name!r}; widen them")
-    doubts = [doubt for doubt in better.open_doubts if doubt != draft.clock.doubt]
-    out = [f"parameters: {one.text}. {ADVICE[one.code]}" for one in bodies] + out
-    return Checked(
-        out + _clipped(config, draft, machine, opened) + _slopes(draft, opened) + _turns(draft, opened), doubts
-    )
+        out += _delays(config, case)
+    out += _clipped(config, draft, machine, opened) + _slopes(draft, opened) + _turns(draft, opened)
+    return Validated(out, [doubt for doubt in better.open_doubts if doubt != draft.clock.doubt])
+
+
+def _delays(config: Config, case: Case) -> list[str]:
+    """Delays that the configuration does not ask for, or not as long as they are."""
+    regression = case.regression
+    outcome, dt = regression.fit(regression.given), regression.logs[0].dt
+    actuators = [command.actuator for command in config.commands]
+    late, note = delay_of(actuators, outcome, regression.independent(outcome), regression.delays, dt)
+    delays = [p for p in config.parameters if any(t.endswith(".delay") for t in p.targets)]
+    if late and not delays and not regression.simulator.model.actuator_delay.any():
+        targets = ", ".join(f"actuator:{name}.delay" for name in actuators)
+        return [f"parameters: {note}; ask for {'one of ' * (len(actuators) > 1)}{targets}"]
+    if late and delays and outcome.delay * dt > max(p.range[1] for p in delays):
+        return [f"parameters: {note}, beyond the bounds of {delays[0].name!r}; widen them"]
+    return []
 
 
 def _draft_of(config: Config, opened: Opened, folder: Path) -> Draft:
@@ -137,53 +122,55 @@ def _draft_of(config: Config, opened: Opened, folder: Path) -> Draft:
     )
 
 
-def _other_readings(changed: Sequence[tuple[Reading, Reading]], times: float) -> list[str]:
-    """Units and signs with which the logs are followed so many times better, whatever the unknowns."""
-    out = []
-    for now, then in changed:
-        where = f"{'commands' if now.commanded else 'measurements'}, column {now.match.column!r}"
-        more = f"fits the log: simulated windows miss {times:.2g} times as much with what stands there"
-        if now.unit != then.unit:
-            named = read_name(now.match.column).unit == now.unit
-            but = "; its name says what stands there, so the model may be as far off instead" if named else ""
-            out.append(f"{where}: unit {now.unit!r} is odd, {then.unit!r} {more}{but}")
-        if now.sign != then.sign:
-            out.append(f"{where}: sign {now.sign} is odd, {then.sign} {more}")
-    return out
-
-
-def _swapped(draft: Draft, trial: Trial) -> tuple[float, list[str]]:
-    """Two columns of one kind that fit better the other way round, with any signs, and the logarithm of by how much."""
-    given, count = trial.given, len(draft.measurements)
-    tried: list[tuple[str, Assumption]] = []
-    for a, b in itertools.combinations(range(len(draft.readings)), 2):
-        one, other = draft.readings[a], draft.readings[b]
-        if one.commanded != other.commanded or one.unit != other.unit:
+def _swapped(case: Case) -> list[str]:
+    """Two columns of commands, or of positions, with which more is explained the other way round."""
+    regression, out = case.regression, []
+    now, environment = case.nats(regression.fit(regression.given)), regression.environment
+    columns = [(k, case.commands[k], case.channels[k][:1]) for k in range(len(case.draft.readings))]
+    for (a, i, at), (b, j, to) in itertools.combinations(columns, 2):
+        one, other = case.draft.readings[a], case.draft.readings[b]
+        if (
+            one.commanded != other.commanded
+            or one.unit != other.unit
+            or len(one.match.columns + other.match.columns) > 2
+        ):
             continue
-        if any(len(r.match.columns) > 1 for r in draft.measurements):
-            continue
-        i, j = (a - count, b - count) if one.commanded else (a, b)
-        order = list(given.actuators if one.commanded else given.channels)
-        order[i], order[j] = order[j], order[i]
-        for signs in itertools.product((1.0, -1.0), repeat=2):
-            factors = list(given.driven if one.commanded else given.observed)
-            factors[i], factors[j] = signs
+        logs = []
+        for log in regression.logs:
+            actions, seen = log.actions.copy(), log.observations.copy()
+            if i is not None and j is not None:
+                actions[:, [i, j]] = actions[:, [j, i]]
+            else:
+                seen[:, [*at, *to]] = seen[:, [*to, *at]]
+            logs.append(Trajectory(seen, actions, log.dt))
+        there = Regression(environment, logs, regression.delays)
+        gain = now - case.nats(there.fit(there.given))
+        if gain > _BETTER:
             names = f"columns {one.match.column!r} and {other.match.column!r}"
-            now = (
-                replace(given, actuators=tuple(order), driven=tuple(factors))
-                if one.commanded
-                else replace(given, channels=tuple(order), observed=tuple(factors))
-            )
-            tried.append((names, now))
-    if not tried:
-        return 0.0, []
-    misses = followed(trial.misses([given, *(now for _, now in tried)], trial.theta))
-    best = int(np.argmin(misses[1:]))
-    gain, names = float(misses[0] - misses[1 + best]), tried[best][0]
-    if gain < _BETTER:
-        return 0.0, []
-    times = f"simulated windows miss {np.exp(gain / count):.2g} times as much as the other way round"
-    return gain, [f"{names} look swapped: {times}"]
+            out.append((gain, f"{names} look swapped: the model explains far more the other way round"))
+    return [max(out)[1]] if out else []
+
+
+def _other_readings(search: Search, part: Draft, better: Draft) -> list[str]:
+    """Units and signs with which the model explains far more."""
+    both = list(zip(part.readings, better.readings, strict=True))
+    pairs = [(a, b) for a, b in both if (a.unit, a.sign) != (b.unit, b.sign)]
+    now, then = search.case.outcome(part.readings), search.case.outcome(better.readings)
+    gain = search.case.nats(now) - search.case.nats(then)
+    if not pairs or (gain < _BETTER and not any(a.commanded and a.sign != b.sign for a, b in both)):
+        return []
+    times = float((now.miss / then.miss).max())
+    out = []
+    for one, other in pairs:
+        where = f"{'commands' if one.commanded else 'measurements'}, column {one.match.column!r}"
+        more = f"fits the log: {times:.2g} times as much of the joints' forces is left with what stands there"
+        if one.unit != other.unit:
+            named = read_name(one.match.column).unit == one.unit
+            but = "; its name says what stands there, so the model may be as far off instead" if named else ""
+            out.append(f"{where}: unit {one.unit!r} is odd, {other.unit!r} {more}{but}")
+        if one.sign != other.sign:
+            out.append(f"{where}: sign {one.sign} is odd, {other.sign} {more}")
+    return out
 
 
 def _clipped(config: Config, draft: Draft, machine: Machine, opened: Opened) -> list[str]:

@@ -1,1 +1,0 @@
-"""What kinematics alone tell of columns, without simulations."""
