@@ -14,6 +14,7 @@ from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.core.telling import Tell, silent
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.bands import predictive_bands
 from sipe_bayes.diagnostics.discovery import Discovery, ModelErrors, Piece, Promise, Stage
@@ -31,7 +32,6 @@ from sipe_bayes.diagnostics.misfit import misfit
 from sipe_bayes.diagnostics.records import Comparison, Signal
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.unknowns import bounded_by_nature
-from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood import BoundLikelihood, QuadraticPrior
 from sipe_bayes.posterior import Particles
 from sipe_bayes.posterior import prior as default_prior

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -12,11 +14,13 @@ from sipe_bayes.inference.progress_bar import ProgressBar
 
 
 def init(
-    model: Annotated[Path | None, typer.Argument(help="The MJCF.")] = None,
+    model: Annotated[Path | None, typer.Argument(help="The MJCF or URDF, or menagerie:NAME.")] = None,
     logs: Annotated[list[Path] | None, typer.Argument(help="Logs: files, folders or patterns.")] = None,
     out: Annotated[Path, typer.Option(help="The configuration to write.")] = Path("calibrate.toml"),
     rate: Annotated[float | None, typer.Option(min=1e-3, help="Hz of the rows, of logs without a clock.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite it.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: what is open stays as proposed.")] = False,
+    plot: Annotated[bool, typer.Option("--plot", help="Draw the matched columns into NAME.png.")] = False,
 ) -> None:
     """A first configuration of `sipe calibrate` from a model and its logs, each guess with its evidence."""
     with exit_on_error():
@@ -24,12 +28,29 @@ def init(
             raise ValueError("expected a model and at least one log: sipe init MODEL.xml LOG...")
         if out.exists() and not force:
             raise ValueError(f"--out {out}: exists already; give --force to overwrite it, or another name")
+        from sipe_bayes.calibration.init.asking import asked
+        from sipe_bayes.calibration.init.plotting import plot_columns
         from sipe_bayes.calibration.init.propose import propose
         from sipe_bayes.calibration.init.write import summary, toml_of
         from sipe_bayes.core.files import write_text
+        from sipe_bayes.envs.foreign.named import model_file
 
         with ProgressBar(unit="configuration", counted=False) as progress:
-            draft = propose(model, logs, out.parent, rate, lambda what: progress(what, 0, 1))
+            draft = propose(model_file(model), logs, out.parent, rate, lambda what: progress(what, 0, 1))
+        if not yes and sys.stdin.isatty() and sys.stdout.isatty():
+            draft = asked(draft, _ask)
         write_text(out, toml_of(draft, command_line()))
-    for line in summary(draft, str(out)):
+        picture = plot_columns(draft, out) if plot else None
+    for line in summary(draft, str(out), picture):
         print(line)
+
+
+def _ask(text: str, answers: Sequence[str]) -> int:
+    """Show a question on the terminal; Enter takes the first answer."""
+    print(f"{text}")
+    for k, answer in enumerate(answers, 1):
+        print(f"  {k}) {answer}")
+    while True:
+        given: int = typer.prompt("which", default=1, type=int)
+        if 1 <= given <= len(answers):
+            return given - 1

@@ -1,7 +1,7 @@
 """Local quadratics over the samples of a log: what is smooth in them, and its slopes.
 
 A. Savitzky, M. Golay 1964, "Smoothing and differentiation of data by simplified least squares procedures", Anal. Chem.
-36; SciPy's.
+36.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from scipy.signal import savgol_coeffs
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.rotations import added, between
@@ -73,4 +72,6 @@ def _span(count: int, dt: float, wider: int = 1) -> int:
 @functools.lru_cache(maxsize=256)
 def _weights(span: int, derivative: int) -> FloatArray:
     """Weights (span, span) of samples in the value, or the slope by sample, of their quadratic at each of them."""
-    return np.stack([savgol_coeffs(span, 2, derivative, pos=at, use="dot") for at in range(span)])
+    powers = np.vander(np.arange(span) - (span - 1) / 2, 3, increasing=True)
+    seen = np.stack([0 * powers[:, 0], powers[:, 0], 2 * powers[:, 1]], axis=1) if derivative else powers
+    return np.asarray(seen @ np.linalg.pinv(powers))

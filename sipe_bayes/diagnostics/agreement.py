@@ -28,10 +28,10 @@ from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.core.telling import Tell, silent
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.laplace import Laplace
-from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood import UNIFORM_PRECISION, BoundLikelihood, Linearisation, Noise, Segments, StateSpace
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.discrepancy import LogEstimate

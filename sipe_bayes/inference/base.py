@@ -26,9 +26,10 @@ from sipe_bayes.core.budget import BudgetExhausted, BudgetTooSmall, Deadline
 from sipe_bayes.core.checkpoint import SearchState, Snapshot, Stored, load_state
 from sipe_bayes.core.findings import Code, Findings, finding
 from sipe_bayes.core.options import Options
+from sipe_bayes.core.telling import silent
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import MOST_ROLLOUTS, flag, path, whole
-from sipe_bayes.inference.recorded import Progress, Recorded, at_bounds, digest, silent
+from sipe_bayes.inference.recorded import Progress, Recorded, at_bounds, digest
 
 if TYPE_CHECKING:
     from sipe_bayes.likelihood import BoundLikelihood, BoundStates, FitResult, Segments, StateSpace

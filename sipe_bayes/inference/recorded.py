@@ -21,13 +21,6 @@ if TYPE_CHECKING:
 Progress = Callable[[str, int, int], None]
 """Called with (what is being done, rollouts so far, budget)."""
 
-Tell = Callable[[str], object]
-"""Called with what is being done."""
-
-
-def silent(what: str) -> None:
-    """A ``Tell`` that says nothing."""
-
 
 class GymnasiumEnvironment(Protocol):
     """What ``sipe.make`` returns, wrapped or not."""

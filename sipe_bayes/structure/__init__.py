@@ -5,9 +5,17 @@ and compares them by what they predict of held-out pieces. It returns ``Structur
 the posterior of the user's parameters stacked over it.
 """
 
-from sipe_bayes.structure.discover import Restriction, discover
-from sipe_bayes.structure.extension import Extension, Placed
-from sipe_bayes.structure.state import DiscoverOptions
-from sipe_bayes.structure.structures import StructureRow, Structures
+from typing import TYPE_CHECKING
 
-__all__ = ["DiscoverOptions", "Extension", "Placed", "Restriction", "StructureRow", "Structures", "discover"]
+from sipe_bayes.core.lazy import exports
+
+if TYPE_CHECKING:
+    from sipe_bayes.structure.discover import Restriction as Restriction
+    from sipe_bayes.structure.discover import discover as discover
+    from sipe_bayes.structure.extension import Extension as Extension
+    from sipe_bayes.structure.extension import Placed as Placed
+    from sipe_bayes.structure.state import DiscoverOptions as DiscoverOptions
+    from sipe_bayes.structure.structures import StructureRow as StructureRow
+    from sipe_bayes.structure.structures import Structures as Structures
+else:
+    __getattr__, __dir__ = exports(__name__)

@@ -28,7 +28,7 @@ import scipy.optimize
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
 from sipe_bayes.core.options import Options, option
-from sipe_bayes.inference.recorded import Tell, silent
+from sipe_bayes.core.telling import Tell, silent
 from sipe_bayes.likelihood import (
     FLAT_PRECISION,
     BoundLikelihood,

@@ -20,8 +20,8 @@ import numpy as np
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
 from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.core.telling import Tell, silent
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood import BoundLikelihood
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import Extension, Placed, extended, imitating, members, placements

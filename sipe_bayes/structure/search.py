@@ -30,7 +30,8 @@ import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.budget import BudgetExhausted, BudgetTooSmall, Deadline
-from sipe_bayes.inference.recorded import Progress, Tell, silent
+from sipe_bayes.core.telling import Tell, silent
+from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood import BoundLikelihood, QuadraticPrior
 from sipe_bayes.structure.augmented import AugmentedModel, DivergesError
 from sipe_bayes.structure.candidates import Candidate, rank_candidates

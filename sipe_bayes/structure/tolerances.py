@@ -10,9 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from sipe_bayes.structure.extensions.numerics import PhysicsStep
-from sipe_bayes.structure.probes import Probe
+
+if TYPE_CHECKING:
+    from sipe_bayes.structure.probes import Probe
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import pytest
 import sipe_bayes as sipe
 from sipe_bayes.calibration.checks.plan import Check, Checks
 from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
-from sipe_bayes.inference.recorded import Tell
+from sipe_bayes.core.telling import Tell
 
 PLAN = {Check.LOGS: 200, Check.RANGES: 50}
 

@@ -14,12 +14,12 @@ from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.telling import Tell
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.agreement import LogEstimates, linear_estimates, log_estimates
 from sipe_bayes.diagnostics.evaluate import LOOKED_AT, channel_noise, white_noise
 from sipe_bayes.diagnostics.records import ChannelNoise, LogReport
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.recorded import Tell
 from sipe_bayes.likelihood import BoundLikelihood, Linearisation, Noise, StateSpace, bind
 from sipe_bayes.structure.discrepancy import parts_of
 

@@ -14,12 +14,12 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.core.telling import Tell
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.evaluate import fitted_residuals
 from sipe_bayes.diagnostics.misfit import misfit
 from sipe_bayes.diagnostics.records import Misfit, Residual
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.recorded import Tell
 from sipe_bayes.likelihood import QuadraticPrior, StateSpace
 from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.structure.augmented import AugmentedModel

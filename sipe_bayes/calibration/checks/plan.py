@@ -11,12 +11,13 @@ import numpy as np
 
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.checkpoint import Kept
+from sipe_bayes.core.telling import Tell
 from sipe_bayes.diagnostics.agreement import LOG_BUDGET
 from sipe_bayes.diagnostics.evaluate import LOOKED_AT, band_cost, starts_cost
 from sipe_bayes.diagnostics.identifiability import GRID
 from sipe_bayes.diagnostics.prior_predictive import PREDICTIVE
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.recorded import Progress, Tell
+from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood import StateSpace, bind
 from sipe_bayes.simulation.base import Simulated
 from sipe_bayes.structure.augmented import steps_of

@@ -14,13 +14,13 @@ from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.telling import Tell
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.bands import predictive_bands
 from sipe_bayes.diagnostics.evaluate import both_predicted, channel_scores, compare_errors, signals
 from sipe_bayes.diagnostics.prior_predictive import OutsidePrior, follows, outside_prior
 from sipe_bayes.diagnostics.records import ChannelScore, Comparison, Signal
 from sipe_bayes.inference.base import Estimator
-from sipe_bayes.inference.recorded import Tell
 from sipe_bayes.likelihood import BoundLikelihood, observation_noise, wild_residuals
 from sipe_bayes.posterior import Posterior
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from sipe_bayes.calibration.checks.fitted import Fit
 from sipe_bayes.calibration.checks.plan import Check, Checks
 from sipe_bayes.core.checkpoint import Kept
+from sipe_bayes.core.telling import Tell
 from sipe_bayes.diagnostics.identifiability import dead_ranges
-from sipe_bayes.inference.recorded import Tell
 
 
 def ranges_that_change_nothing(fit: Fit, checks: Checks) -> dict[str, list[tuple[float, float]]]:

@@ -19,11 +19,11 @@ from sipe_bayes.calibration.init.regression import Gyro, Regression
 from sipe_bayes.calibration.init.unknowns.candidates import as_parameters, candidates
 from sipe_bayes.calibration.logs import load_logs
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.telling import Tell, silent
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.core.units import find_unit
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
-from sipe_bayes.inference.recorded import Tell, silent
 
 _SAMPLES = 20_000  # of a log that are looked at
 _DELAYS = (0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16)
@@ -75,10 +75,25 @@ def loaded(draft: Draft, sources: Sequence[Source], folder: Path) -> list[Trajec
     return [log.slice(0, min(len(log), _SAMPLES)) for log in read]
 
 
-def gyros_of(draft: Draft, machine: Machine) -> list[Reading]:
-    """The draft's rate gyros."""
-    targets = {f"sensor:{name}" for name, kind in machine.sensors if kind == "gyro"}
+def gyros_of(draft: Draft, model: mujoco.MjModel, machine: Machine) -> list[Reading]:
+    """The draft's rate gyros that nothing turns but what is measured."""
+    known = {reading.match.target for reading in draft.measurements}
+    names = [name for name, kind in machine.sensors if kind == "gyro"]
+    targets = {f"sensor:{name}" for name in names if _turning(model, name) <= known}
     return [reading for reading in draft.measurements if reading.match.target in targets]
+
+
+def _turning(model: mujoco.MjModel, sensor: str) -> set[str]:
+    """Targets of what turns a sensor's site."""
+    body, out = int(model.site_bodyid[model.sensor(sensor).objid[0]]), set[str]()
+    while body:
+        for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
+            kind, name = int(model.jnt_type[joint]), model.joint(joint).name
+            ball = kind in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL))
+            if kind != int(mujoco.mjtJoint.mjJNT_SLIDE):
+                out.add(f"body:{model.body(body).name}.orientation" if ball else f"joint:{name}.position")
+        body = int(model.body_parentid[body])
+    return out
 
 
 def case_of(
@@ -107,7 +122,7 @@ def case_of(
         places.append(tuple(range(at, at + len(m.channels))))
         at += len(m.channels)
     regression.gyros = [
-        _gyro(model, machine, regression, reading, [log.observations[:, count + 3 * k :][:, :3] for log in whole])
+        _gyro(model, regression, reading, [log.observations[:, count + 3 * k :][:, :3] for log in whole])
         for k, reading in enumerate(gyros)
     ]
     regression.scales = [_scales_of(reading, machine) for reading in draft.commands]
@@ -118,9 +133,7 @@ def case_of(
     return Case(draft, machine, regression, (*places, *empty), commands, tell=tell)
 
 
-def _gyro(
-    model: mujoco.MjModel, machine: Machine, regression: Regression, reading: Reading, rates: Sequence[FloatArray]
-) -> Gyro:
+def _gyro(model: mujoco.MjModel, regression: Regression, reading: Reading, rates: Sequence[FloatArray]) -> Gyro:
     """A gyro's rates, in any of its units where no name says one."""
     site = int(model.sensor(reading.match.target.removeprefix("sensor:")).objid[0])
     named, own = reading.match.label.unit, find_unit(reading.unit).factor

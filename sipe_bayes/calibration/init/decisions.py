@@ -28,8 +28,8 @@ from sipe_bayes.calibration.init.draft import (
 from sipe_bayes.calibration.init.machine import Drive, Joint, Machine
 from sipe_bayes.calibration.init.regression import Assumption, Outcome, Regression
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.telling import Tell, silent
 from sipe_bayes.core.units import find_unit
-from sipe_bayes.inference.recorded import Tell, silent
 
 DECIDED = 3.0
 """Nats, by which a reading has to be better, so that the logs decide."""
@@ -41,7 +41,8 @@ _TURNS = 0.4  # of a gyro's rates, up to which it turns with what is measured
 _FOLLOWS = 0.5  # share of a set-point's variance, from which a position follows it
 _LATEST = 0.3  # s, of a position behind its set-point
 _USELESS = 0.9  # of the forces, what is left where the model explains nothing
-_NEAR, _FAR = np.log(1.5), np.log(5.0)  # of the logarithm of a ratio: the same; another unit, or a model far off
+_OUTSIDE, _BEYOND = 6.0, 0.1  # nats against samples beyond a joint's range, by a share of which it may be off
+_NEAR, _FAR = np.log(3.0), np.log(5.0)  # of the logarithm of a ratio: the same; another unit, or a model far off
 _ZEROS, _FINER = 17, 9  # zeros that are tried over the range of a joint, and around the best
 _ZERO_GAIN, _LEAST_ZERO = 6.0, 0.05  # nats and rad or m, from which a zero is believed
 _TIMES = 1.5  # of what is left, from which a frame is another one
@@ -72,6 +73,7 @@ class Case:
         commands: number of each reading's actuator; None of measurements.
         minus: pairs of channels, the second of which is taken off the first.
         tell: how far it is.
+        ties: what ``tied_of`` found.
         count: independent numbers of each degree of freedom, the last one; by the motion where there is none.
     """
 
@@ -83,6 +85,7 @@ class Case:
     minus: tuple[tuple[int, int], ...] = ()
     tell: Tell = silent
     count: list[float] = field(default_factory=list)
+    ties: list[dict[int, tuple[int, float]]] = field(default_factory=list)
     _known: dict[Assumption, Outcome] = field(default_factory=dict)
 
     def outcome(self, readings: Readings) -> Outcome:
@@ -117,6 +120,12 @@ class Case:
 
 def tied_of(case: Case) -> dict[int, tuple[int, float]]:
     """Set-points with the place of the position that follows each, and how many times the position it is, in SI."""
+    if not case.ties:
+        case.ties.append(_ties(case))
+    return case.ties[0]
+
+
+def _ties(case: Case) -> dict[int, tuple[int, float]]:
     draft, out = case.draft, dict[int, tuple[int, float]]()
     joints = {f"actuator:{a.name}": f"joint:{a.joint.name}." for a in case.machine.actuators if a.joint is not None}
     kinds = {Drive.POSITION: "position", Drive.VELOCITY: "velocity"}
@@ -267,15 +276,26 @@ def _with_tied(case: Case, readings: Readings, tied: dict[int, tuple[int, float]
 
 
 def _odd_sizes(case: Case, readings: Readings) -> float:
-    """Nats against turns by the dozen, and motions of less than a degree or a millimetre."""
-    odd = 0
+    """Nats against turns by the dozen, motions of less than a degree or a millimetre, and beyond a joint's range."""
+    odd = 0.0
     for now, then, channels in zip(readings, case.draft.readings, case.channels, strict=True):
         for channel in channels:
             size = max(float(np.nanmax(np.abs(log.observations[:, channel]))) for log in case.regression.logs)
             size *= abs(scale_of(now) / scale_of(then))
             angular = find_unit(now.unit).dimension == "angle"
             odd += (size > (40.0 if angular else 20.0)) + (size < (0.02 if angular else 0.002))
+            odd += _OUTSIDE * _outside(case, now, scale_of(now) / scale_of(then), channel)
     return float(odd)
+
+
+def _outside(case: Case, reading: Reading, factor: float, channel: int) -> float:
+    """The share of samples that lie beyond the range of a reading's joint."""
+    reach = next((j.reach for j in case.machine.joints if reading.match.target == f"joint:{j.name}.position"), None)
+    if reach is None:
+        return 0.0
+    values = np.concatenate([log.observations[:, channel] for log in case.regression.logs]) * factor
+    room = _BEYOND * (reach[1] - reach[0])
+    return float(np.mean((values < reach[0] - room) | (values > reach[1] + room)))
 
 
 def searched(case: Case) -> Search:
@@ -310,8 +330,11 @@ def decide(search: Search) -> Draft:
     for q in range(len(search.asked)):
         _with_evidence(search, q, readings)
     _with_ties(case, tied, readings)
-    readings = _driven(case, readings, outcome)
-    return _read_as(draft, readings, [*draft.doubts, *_mirrored(search, readings)])
+    readings = _untied(case, _driven(case, readings, outcome), tied)
+    groups = _mirrored(search)
+    done = _read_as(draft, readings, [*draft.doubts, *_said(groups, readings)])
+    columns = [tuple(readings[k].match.column for k in group) for group in groups]
+    return replace(done, together=tuple(columns))
 
 
 def _without(question: Question, case: Case, tied: dict[int, tuple[int, float]]) -> Question:
@@ -337,6 +360,19 @@ def guessed(readings: Readings) -> list[str]:
     for factor in dict.fromkeys(reading.factor for reading in counting):
         names = ", ".join(repr(reading.match.column) for reading in counting if reading.factor == factor)
         out.append(f"{names}: {1 / factor:g} counts a turn is a guess; write what the encoder has")
+    return out
+
+
+def _untied(case: Case, readings: Readings, tied: dict[int, tuple[int, float]]) -> list[Reading]:
+    """What is said of set-points that no position follows."""
+    measured = {reading.match.target for reading in readings}
+    out = list(readings)
+    for k, reading in enumerate(readings):
+        actuator = next((a for a in case.machine.actuators if reading.match.target == f"actuator:{a.name}"), None)
+        joint = None if actuator is None or case.drive(k) != Drive.POSITION or k in tied else actuator.joint
+        if joint is not None and f"joint:{joint.name}.position" in measured:
+            text = f"the position of {joint.name} does not follow it; if it is a torque, make the actuator a <motor>"
+            out[k] = replace(reading, doubts=(*reading.doubts, text))
     return out
 
 
@@ -394,18 +430,21 @@ def as_well(answer: Answer, rivals: Sequence[tuple[Scale, float]]) -> str:
     return f"{answer} or {', '.join(names)}? the model explains the log as well with either"
 
 
-def _mirrored(search: Search, readings: Readings) -> list[str]:
-    """Signs that may be turned round together, and what drives them."""
-    groups = dict[frozenset[int], None]()
+def _mirrored(search: Search) -> list[tuple[int, ...]]:
+    """Places of readings whose signs may be turned round together, and of what drives them."""
+    groups = dict[tuple[int, ...], None]()
     for q, question in enumerate(search.asked):
         gap, row = search.gap(q, turned(search.best[q])) if question.of_sign else (np.inf, None)
         if row is not None and gap < DECIDED and len(group := search.together(row)) > 1:
-            groups[frozenset(group)] = None
-    out = []
-    for one in groups:
-        names = " and ".join(repr(readings[k].match.column) for k in sorted(one))
-        out.append(f"all moves alike with {names} turned round together: only how they go together is known")
-    return out
+            groups[tuple(sorted(group))] = None
+    return list(groups)
+
+
+def _said(groups: Sequence[Sequence[int]], readings: Readings) -> list[str]:
+    pairs = [" and ".join(repr(readings[k].match.column) for k in one) for one in groups]
+    each = "" if len(pairs) == 1 else "each of "
+    text = f"all moves alike with {each}{'; '.join(pairs)} turned round together: only how they go together is known"
+    return [text] if pairs else []
 
 
 def _put(out: list[Reading], question: Question, note: str, doubt: str, instead: str) -> None:

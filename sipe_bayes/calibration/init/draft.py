@@ -21,10 +21,6 @@ from sipe_bayes.calibration.init.tables import Clock
 
 Row = dict[str, object]
 
-_FLOWN = 2.0  # against unlikely units of what thrust moves: the smaller a motion is read, the better all fits
-_UNLIKELY = 0.01  # of the logarithm of misses, by which what is not likely has to be better
-_CUSTOM = float(np.log(1.5))  # against units where a kind of log usually has a share of the joint's range
-
 
 class Scale(NamedTuple):
     """A unit word, and what a column is multiplied by beside it; or what it says at the ends of its joint's range."""
@@ -196,6 +192,8 @@ class Draft:
         notes: of the whole.
         unused: columns that are none of the model's.
         delay: of the commands, in samples.
+        seconds: that a calibration may take; 0 where nothing says it.
+        together: columns that may be turned round together, in groups.
     """
 
     model: str
@@ -211,6 +209,8 @@ class Draft:
     notes: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
     delay: float = 0.0
+    seconds: float = 0.0
+    together: tuple[tuple[str, ...], ...] = ()
 
     @property
     def readings(self) -> tuple[Reading, ...]:
@@ -259,12 +259,10 @@ class Question:
     Args:
         readings: places in ``Draft.readings``.
         answers: scales or signs, the likeliest first: what names say, or a configuration that is checked.
-        against: by how much another answer than the first has to be better, of the logarithm of misses.
     """
 
     readings: tuple[int, ...]
     answers: tuple[Answer, ...]
-    against: float = _UNLIKELY
 
     @property
     def of_sign(self) -> bool:
@@ -315,12 +313,7 @@ def questions(draft: Draft, machine: Machine) -> list[Question]:
             groups.setdefault((own, scales), []).append(k)
         if len(reading.match.columns) == 1 and reading.match.target not in one_way:
             signs.append(Question((k,), (reading.sign, turned(reading.sign))))
-    usual = _FLOWN if machine.flies else _UNLIKELY
-    units = [
-        Question(tuple(members), scales, _CUSTOM if scales[0].ends else usual)
-        for (_, scales), members in groups.items()
-    ]
-    return units + signs
+    return [*(Question(tuple(members), scales) for (_, scales), members in groups.items()), *signs]
 
 
 def _scales(reading: Reading, machine: Machine) -> tuple[Scale, ...]:

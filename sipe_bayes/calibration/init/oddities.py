@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import mujoco
@@ -18,6 +19,7 @@ from sipe_bayes.core.arrays import BoolArray, FloatArray
 _AT_LIMIT, _NEAR = 0.02, 0.005  # share of the samples; of a joint's range, what is at its limit
 _BEYOND = 0.01  # of the samples, set-points that a range cuts off
 _BLOCKS, _MOVES, _STILL, _FOLLOWED = 10, 0.3, 0.2, 0.7  # parts of a log; of the usual motion; shares of variance
+_AWAY, _LEAST = 3.0, 0.3  # times the usual distance from a set-point; s, of a part
 _JUMP = 12.0  # times the usual largest step, of a jump
 _COARSE, _SLOW = 0.7, 1.5  # rad of a servo's own oscillation in a physics step, and in a sample
 _SPREAD = 4.0  # times the size of a body's geoms, beyond which its inertia is no body's
@@ -103,10 +105,12 @@ def _drive_off(case: Case) -> Iterator[Oddity]:
         for log in case.regression.logs:
             wanted, seen = log.actions[:, command], log.observations[:-1, channel]
             edges = np.linspace(0, len(wanted), _BLOCKS + 1).astype(int)
-            parts = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a > 10]
+            parts = [slice(a, b) for a, b in pairwise(edges) if (b - a) * log.dt > _LEAST]
             moves = [wanted[p].std() > _MOVES * wanted.std() > 0 for p in parts]
             alike = [_alike(wanted[p], seen[p]) for p in parts]
-            off = [p for p, m, a in zip(parts, moves, alike, strict=True) if m and a < _STILL]
+            away = [float(np.sqrt(np.mean((wanted[p] - seen[p]) ** 2))) for p in parts]
+            far = [x > _AWAY * np.median(away) for x in away]
+            off = [p for p, m, a, f in zip(parts, moves, alike, far, strict=True) if m and f and a < _STILL]
             on = [a for m, a in zip(moves, alike, strict=True) if m and a > _FOLLOWED]
             if off and len(on) > 1:
                 begin, end = off[0].start * log.dt, off[-1].stop * log.dt
@@ -140,14 +144,16 @@ def _unsigned(case: Case, opened: Opened) -> Iterator[Oddity]:
     """Torques and currents that never change their sign, of joints that move both ways."""
     both = any(_is_signed(np.diff(values)) for _, _, values in _positions(case))
     used = {column for reading in case.draft.commands for column in reading.match.columns}
+    sizes = []
     for column, values in opened.columns.items():
-        if both and read_name(column).kind in (Kind.TORQUE, Kind.CURRENT) and column not in used:
-            known = values[np.isfinite(values)]
-            if known.min() >= 0 and known.max() > 0:
-                yield Oddity(
-                    "unsigned", f"{column!r} never changes its sign while joints move both ways: it is a size, and no "
-                    "measurement of a force",
-                )  # fmt: skip
+        known = values[np.isfinite(values)]
+        if read_name(column).kind in (Kind.TORQUE, Kind.CURRENT) and column not in used and known.min() >= 0:
+            sizes += [repr(column)] * bool(known.max() > 0)
+    if both and sizes:
+        yield Oddity(
+            "unsigned", f"{', '.join(sizes)}: without a change of sign while joints move both ways: sizes, and no "
+            "measurements of a force",
+        )  # fmt: skip
 
 
 def _is_signed(values: FloatArray) -> bool:

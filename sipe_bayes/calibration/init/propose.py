@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from sipe_bayes.calibration.init.cases import Source, case_of, gyros_of, rough_unknowns, tried_part
 from sipe_bayes.calibration.init.columns.match import Match, Matches
@@ -41,11 +43,12 @@ from sipe_bayes.calibration.readers.base import LogError
 from sipe_bayes.calibration.readers.many import episodes_of, matching
 from sipe_bayes.calibration.readers.numbered import starred
 from sipe_bayes.calibration.readers.tables import READERS, read_table
+from sipe_bayes.core.telling import Tell, silent
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
+from sipe_bayes.envs.foreign.urdf import notes_of
 from sipe_bayes.envs.internal.closed_chains import dependent_joints
 from sipe_bayes.envs.internal.resting import resting_joints
 from sipe_bayes.envs.poses import has_pose, is_round
-from sipe_bayes.inference.recorded import Tell, silent
 from sipe_bayes.likelihood import StateSpace, default_likelihood
 
 _PASSED = 300  # states of each log, of which it is looked what they touch
@@ -58,6 +61,7 @@ _LARGEST_BIAS = {"accelerometer": 1.0, "gyro": 0.2}  # m/s^2, rad/s
 _BLIND = 0.5  # s, windows where nothing tells how fast the machine moves
 _UNTOLD = 0.9  # of the forces, from which no unknown is told
 _UNFOLLOWED = 0.8  # of the forces of a joint, what is left where the model hardly explains them
+_PACED, _ROUNDS = 500, 25  # steps of which the pace is measured; rounds of a fit
 _SPARE = 3  # columns that are not used, of which names are told
 _SHORT = 2.0  # s: logs as short are one window each
 
@@ -79,7 +83,8 @@ def propose(
         LogError: for logs that can not be read, or that hold nothing of the model.
     """
     tell("reading the logs")
-    model = compile_spec(load_spec(str(model_path)), str(model_path))
+    spec = load_spec(str(model_path))
+    model = compile_spec(spec, str(model_path))
     machine = Machine.of(model)
     files = _files(logs)
     opened, others = richest([files[i] for i in _spread(len(files))], rate)
@@ -91,18 +96,32 @@ def propose(
     lines, sources, dropped = _split(files, opened, measurements, commands, folder)
     draft = Draft(
         _relative(model_path, folder), opened.clock, opened.episodes, commands, measurements, lines, 1e-3,
-        doubts=(*dropped, *matches.doubts, *loads([opened, *others]), *_unmatched(model, machine, matches, commands)),
+        doubts=(
+            *notes_of(spec), *dropped, *matches.doubts, *loads([opened, *others]),
+            *_unmatched(model, machine, matches, commands),
+        ),
         notes=tuple(nameless(model, {model.body(body).id for body in machine.bodies})),
         unused=_unused(matches, commands),
     )  # fmt: skip
     positions = bool(tried_part(draft).measurements)
-    trained = (
-        _decided(draft, model, machine, sources, folder, matches.forces, opened, tell)
-        if positions
-        else _undecided(draft, model, machine)
-    )
+    with threadpool_limits(1):  # all matrices are small
+        trained = (
+            _decided(draft, model, machine, sources, folder, matches.forces, opened, tell)
+            if positions
+            else _undecided(draft, model, machine)
+        )
     trained = replace(trained, measurements=with_velocities(trained.measurements, table, opened.clock))
-    return _felt(trained) if _is_felt(machine, matches) else trained
+    done = _felt(trained) if _is_felt(machine, matches) else trained
+    count = sum(max(1, len(log.episodes)) for log in done.logs if log.use == "train")
+    return replace(done, seconds=_expected(model, opened.seconds * count, len(done.proposed)))
+
+
+def _expected(model: mujoco.MjModel, seconds: float, parameters: int) -> float:
+    """How long a calibration may take: some rounds of one rollout for each parameter, at the pace of a few steps."""
+    data, begun = mujoco.MjData(model), time.perf_counter()
+    mujoco.mj_step(model, data, _PACED)
+    step = (time.perf_counter() - begun) / _PACED
+    return 5.0 + _ROUNDS * (parameters + 2) * seconds / model.opt.timestep * step / (os.cpu_count() or 1)
 
 
 def _is_felt(machine: Machine, matches: Matches) -> bool:
@@ -138,7 +157,7 @@ def _files(logs: Sequence[Path]) -> list[Path]:
             within = sorted(p for p in log.iterdir() if p.suffix.lower() in READERS or (p.is_dir() and _is_log(p)))
             if not within:
                 raise LogError(f"{log}: a folder without logs; name the files")
-            out += [p for p in within if p.suffix.lower() != ".txt"] or within  # notes beside the logs
+            out += [p for p in within if p.suffix.lower() not in (".txt", ".json")] or within  # notes beside the logs
             continue
         files = matching(log, Path())
         if not files:
@@ -279,7 +298,7 @@ def _decided(
 ) -> Draft:
     """Units, signs, zeros, delay, unknowns and the window's length, by regressions of the logs."""
     draft = replace(draft, unknowns=tuple(rough_unknowns(model, machine, draft.readings)))
-    part, gyros = tried_part(draft), gyros_of(draft, machine)
+    part, gyros = tried_part(draft), gyros_of(draft, model, machine)
 
     def case(part: Draft) -> Case:
         return case_of(part, model, machine, sources, folder, gyros, tell)

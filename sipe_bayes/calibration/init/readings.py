@@ -26,9 +26,7 @@ _NEAR = 0.12  # relative: a factor between units that is as near is that factor
 _FILTERED = 0.05  # of white noise in the upper frequencies
 _LATE = 1.0  # samples
 _ALIKE = 0.9  # share of variance from which a command is a set-point
-_UNLIKE = 0.2
 _COUNTS = (4096, 1024, 2048, 8192, 16384, 65536, 4000, 2000, 1000, 400, 10000, 20000, 131072, 360)  # to a turn
-_RARER = (8000, 16000, 32768, 40000, 262144)  # that simulations do not tell from the others
 _FEWEST_COUNTS = 30
 _LEAST_TURN, _MOST_TURNS = 0.01, 12.0
 _SHARES = (1.0, 100.0)  # that need not be whole numbers
@@ -131,11 +129,6 @@ def counting_alike(positions: Sequence[Reading], machine: Machine) -> list[Readi
         alike = replace(reading, unit=scales[0].unit, factor=scales[0].factor, scales=scales) if scales else reading
         out.append(alike)
     return out
-
-
-def counts_of(scales: Sequence[Scale]) -> tuple[Scale, ...]:
-    """What whole numbers that are tried may be of a turn, and rarer ones."""
-    return (*scales, *(Scale("rev", 1 / n) for n in _RARER))
 
 
 def _matched(match: Match) -> tuple[str, ...]:
@@ -307,14 +300,7 @@ def _looked_through(reading: Reading, actuator: Actuator, matches: Matches, tabl
         return reading
     alike = likeness(table[reading.match.column], table[place.column])
     if actuator.drive == Drive.POSITION:
-        if alike.share < _UNLIKE and reading.match.label.kind != Kind.SETPOINT:
-            doubt = (
-                f"{actuator.name} takes a set-point of the position, and this does not look like {place.column!r} "
-                f"({100 * alike.share:.0f} % of its variance); if it is a torque, make the actuator a <motor>"
-            )
-            return replace(reading, doubts=(*reading.doubts, doubt))
-        note = f"a set-point: {place.column!r} follows it ({100 * alike.share:.0f} % of its variance)"
-        return replace(reading, notes=(*reading.notes, note))
+        return reading
     if reading.match.label.kind == Kind.SETPOINT or (
         alike.share > _ALIKE and reading.match.label.kind == Kind.COMMAND and actuator.drive == Drive.FORCE
     ):

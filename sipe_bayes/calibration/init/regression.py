@@ -150,6 +150,10 @@ class Regression:
         self.columns = environment.state_columns(model)
         self._data = mujoco.MjData(self.plain)
         self.states = [estimate_states(self.simulator, log, raw=True) for log in self.logs]
+        self._rated = _rated(model, self.columns)
+        for log, states in zip(self.logs, self.states, strict=True):
+            for channel, place in self._rated:  # of a wheel whose speed alone is measured
+                states[:, 1 + place] = _integrated(log.observations[:, channel], log.dt)
         self.actuators = [model.actuator(name).id for name in environment.actuators]
         self.drives = [drive_of(model, index) for index in self.actuators]
         self.period = _period(self.logs)  # samples
@@ -327,6 +331,8 @@ class Regression:
         for channel, column in enumerate(self.columns):
             if column is not None and column - 1 < self.plain.nq:
                 out[:, column - 1] = observed[:, channel]
+        for channel, place in self._rated:
+            out[:, place] = _integrated(observed[:, channel], log.dt)
         return out
 
     @cached_property
@@ -370,7 +376,7 @@ class Regression:
     def _measured(self) -> BoolArray:
         """Degrees of freedom (V,) that the logs measure, and that move."""
         model, known = self.plain, np.zeros(self.plain.nv, bool)
-        columns = {column - 1 for column in self.columns if column is not None}
+        columns = {column - 1 for column in self.columns if column is not None} | {place for _, place in self._rated}
         for joint in range(model.njnt):
             first, dof, size = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]), 1
             size = {0: 6, 1: 3}.get(int(model.jnt_type[joint]), 1)
@@ -498,6 +504,17 @@ def _finer(delays: Sequence[int], costs: FloatArray) -> float:
         if curve[0] > 0:
             return float(np.clip(-curve[1] / (2 * curve[0]), delays[i - 1], delays[i + 1]))
     return float(delays[i])
+
+
+def _rated(model: mujoco.MjModel, columns: Sequence[int | None]) -> list[tuple[int, int]]:
+    """Channels of velocities of hinges and slides whose position no channel measures, with the place of that."""
+    places = {int(model.jnt_dofadr[j]): int(model.jnt_qposadr[j]) for j in range(model.njnt) if model.jnt_type[j] > 1}
+    rated = ((k, places.get(column - 1 - model.nq)) for k, column in enumerate(columns) if column is not None)
+    return [(k, place) for k, place in rated if place is not None and 1 + place not in columns]
+
+
+def _integrated(rates: FloatArray, dt: float) -> FloatArray:
+    return np.concatenate([[0.0], np.cumsum(0.5 * (rates[1:] + rates[:-1]) * dt)])
 
 
 def _bridged(log: Trajectory, environment: MjcfEnvironment) -> Trajectory:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
+from pathlib import Path
 
 from sipe_bayes.calibration.init.draft import Draft, Reading, Unknown
 from sipe_bayes.core.files import printed
 from sipe_bayes.core.toml import to_toml
 
 _WIDTH = 118
-_LINES = 20
 _INLINE = 6  # logs from which they stand on one line each
 
 
@@ -71,27 +72,33 @@ def _unknown(unknown: Unknown) -> str:
     return _comment(f"left out: {unknown.left_out}") + "\n" + "".join(f"# {line}\n" for line in body.splitlines())
 
 
-def summary(draft: Draft, path: str) -> list[str]:
-    """At most 20 lines: what was found, what is open, and what to do next."""
-    lines = [_said(reading) for reading in draft.readings]
-    if len(lines) > 8:
-        lines = [*lines[:7], f"and {len(lines) - 7} columns more"]
+def summary(draft: Draft, path: str, picture: Path | None = None) -> list[str]:
+    """What was found, what is open, and what to do next."""
     held, train = (
         sum(max(1, len(log.episodes)) for log in draft.logs if log.use == use) for use in ("holdout", "train")
     )
-    lines += map(_short, _unused(draft))
-    lines.append(f"time {draft.clock.column!r} in {draft.clock.unit}; {train} to train on, {held} held out")
     names = [unknown.name for unknown in draft.proposed]
-    lines.append(_short(f"{len(names)} unknowns: {', '.join(names)}"))
-    lines += [_short(u.note) for u in draft.proposed if u.name == "delay"]
-    open_lines = [f"OPEN: {doubt}" for doubt in draft.open_doubts]
-    room = _LINES - len(lines) - 2
-    if len(open_lines) > room:
-        open_lines = [
-            *open_lines[: room - 1],
-            f"and {len(open_lines) - room + 1} more that are open, see OPEN in {path}",
-        ]
-    return [*lines, *map(_short, open_lines), f"{path} is written; look it through, then: sipe calibrate {path}"]
+    return [
+        *_table([_said(reading) for reading in draft.readings]),
+        *_unused(draft),
+        f"time {draft.clock.column!r} in {draft.clock.unit}; {train} to train on, {held} held out",
+        f"{len(names)} parameters: {', '.join(names)}",
+        *(u.note for u in draft.proposed if u.name == "delay"),
+        *(f"OPEN: {doubt}" for doubt in draft.open_doubts),
+        *([] if picture is None else [f"columns: {picture}"]),
+        f"next: sipe calibrate {path}{_about(draft.seconds)}",
+    ]
+
+
+def _table(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(n) for cell, n in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def _about(seconds: float) -> str:
+    if not seconds:
+        return ""
+    return f" (about {seconds:.0f} s)" if seconds < 100 else f" (about {seconds / 60:.0f} min)"
 
 
 def _unused(draft: Draft) -> list[str]:
@@ -99,15 +106,11 @@ def _unused(draft: Draft) -> list[str]:
     return [f"not used: {', '.join(left[:12])}{f' and {len(left) - 12} others' * (len(left) > 12)}"] if left else []
 
 
-def _said(reading: Reading) -> str:
-    columns = ", ".join(reading.match.columns)
+def _said(reading: Reading) -> tuple[str, ...]:
+    """A row of the table: target, columns, unit, and what else."""
     sign = "-" if reading.sign < 0 else ""
     word = str(reading.scale) if reading.ends else reading.unit
     unit = f"quaternion {reading.match.quaternion}" if reading.match.quaternion else f"{sign}{word}"
-    extra = f", zero {reading.zero:.4g}" * bool(reading.zero) + ", wraps" * reading.wraps
-    extra += ", starts windows only" * (not reading.fit)
-    return _short(f"{reading.match.target} <- {columns} [{unit}]{extra}")
-
-
-def _short(line: str) -> str:
-    return line if len(line) <= 160 else f"{line[:157]}..."
+    extra = [f"zero {reading.zero:.4g}"] * bool(reading.zero) + ["wraps"] * reading.wraps
+    extra += ["not fitted"] * (not reading.fit)
+    return reading.match.target, f"<- {', '.join(reading.match.columns)}", f"[{unit}]", ", ".join(extra)

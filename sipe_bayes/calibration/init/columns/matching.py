@@ -21,6 +21,7 @@ Table = Mapping[str, FloatArray]
 Families = Mapping[str, list[Label]]
 
 _NEVER = -2.0
+_IN_ORDER = 1e-6  # where names do not decide, columns come in the order of what they are of
 _EXACTLY = 0.5  # for a column that has all words of a joint's name, over one that has those of another's body
 _CALLED = 0.65  # how alike a column and a joint are, from which it is called after it
 _TENDONS = 0.3  # how alike a column and a tendon's actuator are, from which it is called after that and not a joint
@@ -160,6 +161,7 @@ def _assigned(joints: Sequence[Joint], labels: Sequence[Label], kind: Kind, plac
         return []
     scores = np.array([[_of_joint(x, j, places.get(x.column), len(joints)) for j in joints] for x in labels])
     scores += [[0.05 * x.measured - 0.002 * k] for k, x in enumerate(labels)]
+    scores += _IN_ORDER * np.outer(range(len(labels)), range(len(joints)))
     word = {Kind.POSITION: "position", Kind.TORQUE: "force"}.get(kind, "velocity")
     alone = len(labels) == len(joints) == 1
     pairs = sorted(_solved(scores), key=lambda pair: pair[1])
@@ -235,6 +237,7 @@ def _commands(machine: Machine, labels: Sequence[Label], places: Mapping[str, in
 
     scores = np.array([[score(x, a) for a in actuators] for x in labels])
     scores -= [[0.002 * k] for k in range(len(labels))]
+    scores += _IN_ORDER * np.outer(range(len(labels)), range(len(actuators)))
     pairs = sorted(_solved(scores), key=lambda pair: pair[1])
     alone, names = len(actuators) == 1, [actuator.name for actuator in actuators]
     moved = [actuator.joint.name if actuator.joint else "" for actuator in actuators]

@@ -46,7 +46,6 @@ def candidates(
     gains = _shared_by_rotors(
         model, [u for a, r in driven for u in (*_of_actuator(model, a, r), *_lag_of(model, a))], driven
     )
-    open_scale = scale_is_open(model, machine, readings)
     behind = [int(model.joint(joint.name).bodyid[0]) for joint in (*joints, *passive)]
     bodies = [model.body(body).id for body in machine.bodies]  # what is pushed, or carries joints
     free = bodies if driven else []  # what is only thrown moves alike whatever its mass
@@ -59,8 +58,6 @@ def candidates(
     ]  # the gain of a speed is the same
     rotors = {actuator.joint for actuator in machine.actuators}
     of_joints += [u for joint in passive for u in of_joint(model, joint, sizes, rotor=joint in rotors)]
-    if open_scale and len(joints) < 2:  # a rotor is so much more mass, to which the gain is relative
-        of_joints = [u for u in of_joints if not u.name.endswith("_armature")]
     flown = [body for body in bodies if body in {_thrust_at(model, a) for a, _ in driven}]
     shapes = [unknown for body in flown if not attached for unknown in _of_base(model, body)]
     proposed = gains + masses + shapes + of_joints + attached + _zeros(readings)

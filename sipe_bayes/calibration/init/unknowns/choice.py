@@ -100,7 +100,7 @@ def roomy(model: mujoco.MjModel, unknown: Unknown, theta: float) -> Unknown:
         high *= _BEYOND
     if (low, high) == (unknown.low, unknown.high):
         return unknown
-    note = f"{unknown.note}; bounds wider, since simulated windows press against the usual one"
+    note = f"{unknown.note}; bounds wider, since the logs press against the usual one"
     low = rounded_up(low) if low > 0 else float(f"{low:.2g}")  # never below the least
     return replace(unknown, low=low, high=float(f"{high:.2g}"), note=note)
 

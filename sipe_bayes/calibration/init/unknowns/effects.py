@@ -44,7 +44,7 @@ def fit_unknowns(regression: Regression, outcome: Outcome, start: FloatArray) ->
     """
     given = np.clip(start, 0.0, 1.0)
     late = regression.delays[int(np.argmin(outcome.behind))] if len(outcome.behind) else 0
-    dofs = np.flatnonzero(regression.known & (outcome.miss < 1.0))
+    dofs = np.flatnonzero(regression.known & (outcome.size > 0))
     if not len(dofs) or not len(given):
         return Fit(given, np.full(len(given), np.inf), np.zeros((1, len(given))))
     base = _left(regression, given, late)[:, dofs]

@@ -1,0 +1,97 @@
+"""Questions that a person can answer, where the logs do not: one for each thing that stays open with an alternative."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from sipe_bayes.calibration.init.draft import Draft, Reading, turned
+
+Ask = Callable[[str, Sequence[str]], int]
+"""Shows a question and its answers, the default first, and returns the number of the one that is given."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A question: its text, its answers, and what each makes of the draft."""
+
+    text: str
+    answers: tuple[str, ...]
+    drafts: tuple[Callable[[Draft], Draft], ...]
+
+
+def choices_of(draft: Draft) -> list[Choice]:
+    """All questions of a draft."""
+    out = []
+    for k, reading in enumerate(draft.readings):
+        others = _alternatives(reading.instead)
+        if others and reading.doubts:
+            columns = ", ".join(map(repr, reading.match.columns))
+            answers = (f"as proposed: {_now(reading)}", *("; ".join(lines) for lines in others))
+            changes = (_settled(k, ()), *(_settled(k, lines) for lines in others))
+            out.append(Choice(f"{columns}: {'; '.join(reading.doubts)}", answers, changes))
+    for turned_columns in draft.together:
+        group = [k for k, reading in enumerate(draft.readings) if reading.match.column in turned_columns]
+        names = " and ".join(map(repr, turned_columns))
+        text = f"{names}: the logs do not tell whether they are turned round together"
+        out.append(Choice(text, ("as proposed", "turned round"), (lambda d: d, _turned(group))))
+    return out
+
+
+def asked(draft: Draft, ask: Ask) -> Draft:
+    """The draft with the answers."""
+    for choice in choices_of(draft):
+        draft = choice.drafts[ask(choice.text, choice.answers)](draft)
+    return draft
+
+
+def _now(reading: Reading) -> str:
+    return f"unit {reading.unit}, sign {reading.sign}" + (f", factor {reading.factor:g}" if reading.factor != 1 else "")
+
+
+def _alternatives(lines: Sequence[str]) -> list[tuple[str, ...]]:
+    """Lines of TOML by alternative: each begins where a key comes again."""
+    out: list[list[str]] = []
+    for line in lines:
+        key = line.partition(" =")[0]
+        if not out or key in [own.partition(" =")[0] for own in out[-1]] or key in ("unit", "sign", "column"):
+            out.append([])
+        out[-1].append(line)
+    return [tuple(own) for own in out]
+
+
+def _settled(k: int, lines: Sequence[str]) -> Callable[[Draft], Draft]:
+    """Reading number ``k`` with these lines in its table, and nothing open."""
+
+    def change(draft: Draft) -> Draft:
+        keys = tomllib.loads("\n".join(lines))
+        if "unit" in keys:
+            keys = {"factor": 1.0, "zero": 0.0} | keys
+        changed = replace(draft.readings[k], doubts=(), instead=(), **_fields(draft.readings[k], keys))
+        return _put(draft, {k: changed})
+
+    return change
+
+
+def _fields(reading: Reading, keys: dict[str, Any]) -> dict[str, Any]:
+    """Fields of a reading by keys of its table."""
+    column = keys.pop("column", None)
+    match = reading.match if column is None else replace(reading.match, columns=(str(column),))
+    quaternion = keys.pop("quaternion", None)
+    match = match if quaternion is None else replace(match, quaternion=str(quaternion))
+    return {"match": match, "ends": None if "unit" in keys else reading.ends} | keys
+
+
+def _turned(group: Sequence[int]) -> Callable[[Draft], Draft]:
+    def change(draft: Draft) -> Draft:
+        return _put(draft, {k: draft.readings[k].turned_to(turned(draft.readings[k].sign)) for k in group})
+
+    return change
+
+
+def _put(draft: Draft, changed: dict[int, Reading]) -> Draft:
+    readings = [changed.get(k, reading) for k, reading in enumerate(draft.readings)]
+    measured = len(draft.measurements)
+    return replace(draft, measurements=tuple(readings[:measured]), commands=tuple(readings[measured:]))
