@@ -227,6 +227,12 @@ class ParameterSpace(Sequence[Parameter]):
         """Theta (N,) of the model's own values; 0.5 where a parameter has none."""
         return np.array([0.5 if p.default is None else float(p.normalise(p.default)) for p in self._parameters])
 
+    @property
+    def expected_theta(self) -> FloatArray:
+        """Theta (N,) of the means of normal priors, and of the model's own values where a prior is none."""
+        means = [p.default if p.prior_mean is None else p.prior_mean for p in self._parameters]
+        return np.array([0.5 if x is None else float(p.normalise(x)) for p, x in zip(self, means, strict=True)])
+
     def check_shape(self, array: ArrayLike) -> FloatArray:
         """``array`` as float64 (..., N); raises ValueError when it is not numbers or its last axis is not N."""
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sipe_bayes.calibration.init.machine import Drive
 from sipe_bayes.calibration.init.regression import Regression
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.findings import Code, Finding, finding
@@ -20,11 +21,14 @@ def not_followed(problem: Problem) -> tuple[Finding, ...]:
     model, other = regression.simulator.model, regression.fit(regression.given)
     regression.one_way[:] = True  # signs are those of the configuration
     outcome = regression.fit(regression.given)
+    held = [i for i, drive in zip(regression.actuators, regression.drives, strict=True) if drive == Drive.POSITION]
+    served = {int(model.jnt_dofadr[model.actuator_trnid[i, 0]]) for i in held}  # by gains that few models have right
     fitted, out = problem.likelihood.fit or problem.environment.channels, []
     for channel in problem.environment.measurements:
         if channel.label in fitted and channel.target.startswith("joint:") and channel.target.endswith(".position"):
             dof = int(model.joint(channel.target[6:].rpartition(".")[0]).dofadr[0])
-            lost = outcome.miss[dof] > min(_LEFT, _TIMES * other.miss[dof])
+            least = _TIMES * other.miss[dof]
+            lost = outcome.miss[dof] > (least if dof in served else min(_LEFT, least))
             if regression.known[dof] and lost:
                 out.append(finding(Code.COLUMN_NOT_FOLLOWED, channel=channel.label, times=float(outcome.miss[dof])))
     return tuple(out)

@@ -39,6 +39,7 @@ GYRO_WORDS = ("rad/s", "deg/s")
 _ALIKE = np.log(1.12)  # sizes of units that no model is right enough to tell apart
 _TURNS = 0.4  # of a gyro's rates, up to which it turns with what is measured
 _FOLLOWS = 0.5  # share of a set-point's variance, from which a position follows it
+_AGAINST = 0.3  # of a set-point's variance, by which it has to be told that a position goes the other way
 _LATEST = 0.3  # s, of a position behind its set-point
 _USELESS = 0.9  # of the forces, what is left where the model explains nothing
 _OUTSIDE, _BEYOND = 6.0, 0.1  # nats against samples beyond a joint's range, by a share of which it may be off
@@ -46,6 +47,7 @@ _NEAR, _FAR = np.log(3.0), np.log(5.0)  # of the logarithm of a ratio: the same;
 _ZEROS, _FINER = 17, 9  # zeros that are tried over the range of a joint, and around the best
 _ZERO_GAIN, _LEAST_ZERO = 6.0, 0.05  # nats and rad or m, from which a zero is believed
 _TIMES = 1.5  # of what is left, from which a frame is another one
+_WELL = 0.1  # of the forces, up to which no other frame is tried
 _EXPLAINED = 0.5  # of the forces, what may be left with a zero that the logs alone tell
 _SPRUNG = 6.0  # nats for each joint, from which springs are believed
 _BELIEVED, _LOOKED = 0.3, 8  # of the forces, up to which no zero is looked for; joints of which the grids are tried
@@ -146,18 +148,22 @@ def _ratio(regression: Regression, command: int, channel: int) -> tuple[float, f
 
     Whichever position comes up to a quarter of the time later in which the motion goes to and fro.
     """
-    best = 0.0, 0.0
+    along, against = (0.0, 0.0), (0.0, 0.0)
     most = int(min(_LATEST / regression.logs[0].dt, regression.period / 4))
     for late in range(most + 1):
-        pairs = [
-            (log.actions[: len(log) - late, command], log.observations[late:-1, channel]) for log in regression.logs
-        ]
+        logs = regression.logs
+        pairs = [(log.actions[: len(log) - late, command], log.observations[late:-1, channel]) for log in logs]
         one, other = (np.concatenate([x - x.mean() for x in own]) for own in zip(*pairs, strict=True))
         size = float((one @ one) * (other @ other))
-        share = float(one @ other) ** 2 / size if size > 0 else 0.0
-        if share > best[1]:  # of the spreads, which noise of either does not shrink
-            best = float(np.sign(one @ other) * np.sqrt((one @ one) / (other @ other))), share
-    return best
+        if size <= 0:
+            continue
+        share, times = float(one @ other) ** 2 / size, float(np.sqrt((one @ one) / (other @ other)))
+        if one @ other > 0:  # of the spreads, which noise of either does not shrink
+            along = max(along, (share, times))
+        else:
+            against = max(against, (share, -times))
+    share, times = against if against[0] > along[0] + _AGAINST else along
+    return times, share
 
 
 @dataclass
@@ -261,8 +267,9 @@ def _with_tied(case: Case, readings: Readings, tied: dict[int, tuple[int, float]
     out = list(readings)
     for k, (place, times) in tied.items():
         own, then = readings[place], case.draft.readings
-        if own.scale in (*own.shares, *own.scales) and own.scale in (*out[k].shares, *out[k].scales):
-            out[k] = out[k].read_as(own.scale)
+        raw = abs(times) * abs(scale_of(then[place]) / scale_of(then[k]))  # of what the columns say
+        if own.scale in (*own.shares, *own.scales) and abs(np.log(raw)) < _NEAR and not out[k].match.label.unit:
+            out[k] = replace(out[k], scales=own.scales, shares=own.shares, reach=own.reach).read_as(own.scale)
         elif not out[k].match.label.unit and (words := unit_words(out[k], case.machine)):
             wanted = abs(times) * abs(scale_of(then[k]) / scale_of(then[place]))  # of raw columns
             size = abs(scale_of(own))
@@ -281,10 +288,14 @@ def _odd_sizes(case: Case, readings: Readings) -> float:
     for now, then, channels in zip(readings, case.draft.readings, case.channels, strict=True):
         for channel in channels:
             size = max(float(np.nanmax(np.abs(log.observations[:, channel]))) for log in case.regression.logs)
-            size *= abs(scale_of(now) / scale_of(then))
+            factor = scale_of(now) / scale_of(then)
+            size *= abs(factor)
             angular = find_unit(now.unit).dimension == "angle"
             odd += (size > (40.0 if angular else 20.0)) + (size < (0.02 if angular else 0.002))
-            odd += _OUTSIDE * _outside(case, now, scale_of(now) / scale_of(then), channel)
+            odd += (
+                angular and abs(float(np.nanmedian(case.regression.logs[0].observations[:, channel])) * factor) > np.pi
+            )
+            odd += _OUTSIDE * _outside(case, now, factor, channel)
     return float(odd)
 
 
@@ -426,7 +437,8 @@ def missing_more(answer: Answer, others: Sequence[tuple[Scale, float]]) -> str:
 def as_well(answer: Answer, rivals: Sequence[tuple[Scale, float]]) -> str:
     """That others may be right."""
     counts = isinstance(answer, Scale) and answer.factor != 1 and all(other.unit == answer.unit for other, _ in rivals)
-    names = [f"{1 / other.factor:g}" if counts else str(other) for other, _ in sorted(rivals, key=lambda one: one[1])]
+    some = [other for other, _ in sorted(rivals, key=lambda one: one[1])]
+    names = [f"{1 / x.factor:g}" + f" with 0 at {x.zero:g}" * bool(x.zero) if counts else str(x) for x in some]
     return f"{answer} or {', '.join(names)}? the model explains the log as well with either"
 
 
@@ -657,14 +669,17 @@ def absolute_angles(search: Search, model: mujoco.MjModel) -> list[str]:
     of = {r.match.target: (k, case.channels[k][0]) for k, r in enumerate(case.draft.readings) if case.channels[k]}
     here = search.tried[search.best][1].miss
     for own, before in _chained(model, case.machine, {target: channel for target, (_, channel) in of.items()}):
-        if here[int(model.joint(own.split(":")[1].rpartition(".")[0]).dofadr[0])] < _EXPLAINED:
+        if here[int(model.joint(own.split(":")[1].rpartition(".")[0]).dofadr[0])] < _WELL:
             continue
         (k, channel), (_, other) = of[own], of[before]
-        there = Search(replace(case, minus=((channel, other),), count=[], _known={}), search.asked, search.tied)
+        there = Search(
+            replace(case, minus=((channel, other),), count=[*case.count], _known={}), search.asked, search.tied
+        )
         signs = [q for q, question in enumerate(search.asked) if question.of_sign]
         pair = [q for q in signs if {k, of[before][0]} & {*search.asked[q].readings}]
         groups = [(), *((q,) for q in pair), tuple(pair)]
-        there.add([tuple(turned(a) if q in g else a for q, a in enumerate(search.best)) for g in groups])
+        there.add([search.best, *_singles(search.best, search.asked)])
+        there.add([tuple(turned(a) if q in g else a for q, a in enumerate(there.best)) for g in groups])
         better = search.nats(search.best) - there.nats(there.best)
         left = here / there.tried[there.best][1].miss
         if better > _ZERO_GAIN and left.max() > _TIMES:

@@ -20,19 +20,25 @@ from sipe_bayes.calibration.init.machine import Drive, Machine
 from sipe_bayes.calibration.init.tables import Clock
 
 Row = dict[str, object]
+_WIDE = 1.5  # sd of the logarithm of what a regression says of a gain
 
 
 class Scale(NamedTuple):
-    """A unit word, and what a column is multiplied by beside it; or what it says at the ends of its joint's range."""
+    """A unit word, and what a column is multiplied by beside it; or what it says at the ends of its joint's range.
+
+    zero: what a column of counts says in the middle of its turn, where it is at 0 there.
+    """
 
     unit: str
     factor: float = 1.0
     ends: tuple[float, float] | None = None
+    zero: float = 0.0
 
     def __str__(self) -> str:
         if self.ends:
             return f"{self.ends[0]:g} to {self.ends[1]:g} of the joint's range"
-        return self.unit if self.factor == 1 else f"{1 / self.factor:g} counts a {self.unit}"
+        middle = f" with 0 at {self.zero:g}" if self.zero else ""
+        return self.unit if self.factor == 1 else f"{1 / self.factor:g} counts a {self.unit}{middle}"
 
 
 @dataclass(frozen=True)
@@ -83,12 +89,15 @@ class Reading:
     @property
     def scale(self) -> Scale:
         """What it is read as."""
-        return Scale(self.unit, 1.0, self.ends) if self.ends else Scale(self.unit, self.factor)
+        if self.ends:
+            return Scale(self.unit, 1.0, self.ends)
+        middle = any(scale.zero == self.zero for scale in self.scales)
+        return Scale(self.unit, self.factor, None, self.zero if middle else 0.0)
 
     def read_as(self, scale: Scale) -> Reading:
         """With another scale, which has a zero of its own where it is a share of the joint's range."""
         if scale.ends is None or self.reach is None:
-            zero = 0.0 if self.ends else self.zero
+            zero = scale.zero if self.ends or scale.zero or self.scale.zero else self.zero
             return replace(self, unit=scale.unit, factor=scale.factor, zero=zero, ends=None)
         if scale.ends == self.ends:
             return self
@@ -114,7 +123,7 @@ class Reading:
         other = self.read_as(scale)
         unit = f'unit = "{scale.unit}"' + "  # and no factor, no zero" * bool(self.ends and not other.ends)
         factor = [f"factor = {other.factor!r}"] if other.factor != 1 else []
-        return unit, *factor, *([f"zero = {other.zero!r}"] if other.ends else [])
+        return unit, *factor, *([f"zero = {other.zero!r}"] if other.ends or scale.zero else [])
 
     def row(self) -> Row:
         """Its table in the configuration."""
@@ -138,7 +147,11 @@ class Reading:
 
 @dataclass(frozen=True)
 class Unknown:
-    """A parameter that is proposed; left_out says why it stands in a comment only."""
+    """A parameter that is proposed.
+
+    left_out says why it stands in a comment only. expected, SI: what the logs say of a size that may be anything, which
+    then has a log scale and a wide prior.
+    """
 
     name: str
     targets: tuple[str, ...]
@@ -147,12 +160,17 @@ class Unknown:
     relative: bool
     note: str
     left_out: str = ""
+    expected: float | None = None
 
     def row(self) -> Row:
         """Its table in the configuration."""
         target: Row = {"target": self.targets[0]} if len(self.targets) == 1 else {"targets": list(self.targets)}
         row: Row = {"name": self.name}
-        return row | target | {"factor" if self.relative else "bounds": [self.low, self.high]}
+        row |= target | {"factor" if self.relative else "bounds": [self.low, self.high]}
+        if self.expected is None:
+            return row
+        wide = {"mean": self.expected, "sd": float(f"{_WIDE * self.expected:.3g}")}
+        return row | {"scale": "log", "prior": wide}
 
 
 @dataclass(frozen=True)
@@ -280,14 +298,14 @@ def unit_words(reading: Reading, machine: Machine) -> tuple[str, ...]:
     if target.startswith("joint:"):
         joint = next(j for j in machine.joints if target.startswith(f"joint:{j.name}."))
         if target.endswith(".position"):
-            return ("rad", "deg") if joint.hinge else ("m", "mm", "cm")
-        return ("rad/s", "deg/s", "rpm") if joint.hinge else ("m/s", "mm/s")
+            return ("rad", "deg", "rev") if joint.hinge else ("m", "mm", "cm")
+        return ("rad/s", "deg/s", "rpm", "rev/s") if joint.hinge else ("m/s", "mm/s")
     actuator = next(a for a in machine.actuators if target == f"actuator:{a.name}")
     hinge = actuator.turns
     if actuator.drive == Drive.POSITION:
-        return ("rad", "deg") if hinge else ("m", "mm", "cm")
+        return ("rad", "deg", "rev") if hinge else ("m", "mm", "cm")
     if actuator.drive == Drive.VELOCITY:
-        return ("rad/s", "deg/s", "rpm") if hinge else ("m/s", "mm/s")
+        return ("rad/s", "deg/s", "rpm", "rev/s") if hinge else ("m/s", "mm/s")
     if kind == Kind.CURRENT:
         return ("A", "mA")
     if kind == Kind.DUTY:

@@ -19,11 +19,12 @@ from sipe_bayes.calibration.init.columns.match import Match
 from sipe_bayes.calibration.init.columns.signals import Likeness
 from sipe_bayes.calibration.init.draft import Draft, Reading
 from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.regression import turning_of
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.units import find_unit, unit_words
 
 _FOLLOWS = 0.3  # share of variance from which a column is the force of a drive, whose gains may be off
-_UNSURE, _FAR = np.log(1.5), np.log(4.0)  # of the logarithm of how many times the model's force it is
+_UNSURE, _FAR = np.log(1.5), np.log(6.0)  # of the logarithm of how many times the model's force it is
 _FEWEST = 20  # rows
 
 
@@ -52,7 +53,10 @@ def with_forces(
     first = tuple(Reading(m, m.label.unit or _words(machine, m)[0]) for m in known)
     whole = replace(draft, measurements=(*draft.measurements, *first))
     regression = case_of(draft, model, machine, sources, folder).regression
-    motion, place = regression.given_motion, sum(len(m.channels) for m in draft.config(folder).measurements)
+    outcome, motion = regression.fit(regression.given), regression.given_motion
+    damping = regression.simulator.model.dof_damping
+    seen = motion.asked + damping * motion.speed + outcome.friction * turning_of(motion.speed)
+    place = sum(len(m.channels) for m in draft.config(folder).measurements)
     logs = [log.slice(0, len(own)) for log, own in zip(loaded(whole, sources, folder), regression.logs, strict=True)]
     measured = np.concatenate(
         [
@@ -63,8 +67,7 @@ def with_forces(
     readings = []
     for k, reading in enumerate(first):
         dof = int(model.joint(_joint(reading)).dofadr[0])
-        like = max((_likeness(one[:, dof].sum(-1), measured[:, k]) for one in motion.given), key=lambda one: one.share)
-        decided = _decided(reading, like)
+        decided = _decided(reading, _likeness(seen[:, dof], measured[:, k]))
         if decided.fit:
             readings.append(decided)
         else:

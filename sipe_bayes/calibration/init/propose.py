@@ -61,7 +61,7 @@ _LARGEST_BIAS = {"accelerometer": 1.0, "gyro": 0.2}  # m/s^2, rad/s
 _BLIND = 0.5  # s, windows where nothing tells how fast the machine moves
 _UNTOLD = 0.9  # of the forces, from which no unknown is told
 _UNFOLLOWED = 0.8  # of the forces of a joint, what is left where the model hardly explains them
-_PACED, _ROUNDS = 500, 25  # steps of which the pace is measured; rounds of a fit
+_PACED, _ROUNDS = 500, 8  # steps of which the pace is measured; rounds of a fit
 _SPARE = 3  # columns that are not used, of which names are told
 _SHORT = 2.0  # s: logs as short are one window each
 
@@ -363,8 +363,9 @@ def _unknowns(
     unknowns = [unknown for unknown in unknowns if unknown.name in names]
     told = outcome.miss[regression.known]
     actuators = [r.match.target.removeprefix("actuator:") for r in draft.commands]
-    own = np.clip(wide.regression.simulator.environment.space.default_theta, 0.0, 1.0)
-    left = fit_unknowns(wide.regression, outcome, started(names, unknowns, own, values))
+    space = wide.regression.environment.space
+    own = np.clip(space.default_theta, 0.0, 1.0)
+    left = fit_unknowns(wide.regression, outcome, started(space, values))
     late, note = delay_of(actuators, outcome, regression.independent(outcome), regression.delays, logs[0].dt)
     shown, at = chosen(model, unknowns, left, own, scale_is_open(model, machine, draft.readings))
     if len(told) and told.min() > _UNTOLD:

@@ -27,6 +27,7 @@ _FILTERED = 0.05  # of white noise in the upper frequencies
 _LATE = 1.0  # samples
 _ALIKE = 0.9  # share of variance from which a command is a set-point
 _COUNTS = (4096, 1024, 2048, 8192, 16384, 65536, 4000, 2000, 1000, 400, 10000, 20000, 131072, 360)  # to a turn
+_SERVO_COUNTS = (4096, 1024)  # of Dynamixel X and Feetech STS, and of AX and SCS
 _FEWEST_COUNTS = 30
 _LEAST_TURN, _MOST_TURNS = 0.01, 12.0
 _SHARES = (1.0, 100.0)  # that need not be whole numbers
@@ -91,23 +92,28 @@ def _position(machine: Machine, match: Match, table: Table, turns: Mapping[str, 
         label = replace(match.label, unit=unit)
         note = f"jumps by {turn:.5g} where it comes round: {unit}, jumps are taken out"
         return replace(reading, match=replace(match, label=label), unit=unit, wraps=True, notes=(*reading.notes, note))
-    counts = _counts(table[match.column]) if reading.unit == "rad" and not match.label.unit else ()
+    counts = _counts(table[match.column], match.label) if reading.unit == "rad" and not match.label.unit else ()
     if counts:
-        return replace(reading, unit=counts[0].unit, factor=counts[0].factor, scales=counts)
+        return replace(reading, scales=counts).read_as(counts[0])
     if white_share(table[match.column]) < _FILTERED:
         note = "looks filtered: hardly any noise at its highest frequencies; its lag would count as a delay"
         reading = replace(reading, notes=(*reading.notes, note))
     return reading
 
 
-def _counts(values: FloatArray) -> tuple[Scale, ...]:
-    """What whole numbers may be of a turn, the likeliest first; nothing for others."""
+def _counts(values: FloatArray, label: Label) -> tuple[Scale, ...]:
+    """What whole numbers may be of a turn, the likeliest first; nothing for others.
+
+    Of servos, which are at 0 in the middle of their turn, what stands in their tables.
+    """
     known = values[np.isfinite(values)]
     span = float(np.ptp(known)) if len(known) else 0.0
     if span < _FEWEST_COUNTS or (np.mod(known, 1) != 0).any():
         return ()
-    turns = (_LEAST_TURN, _MOST_TURNS)
-    return tuple(Scale("rev", 1 / n) for n in _COUNTS if turns[0] < span / n < turns[1])
+    if {"present", "goal"} & {*pieces_of(label.column)}:
+        servos = [n for n in _SERVO_COUNTS if known.min() >= 0 and known.max() < n]
+        return (*(Scale("rev", 1 / n, None, n / 2) for n in servos), Scale("rev", 1 / _SERVO_COUNTS[0]))
+    return tuple(Scale("rev", 1 / n) for n in _COUNTS if _LEAST_TURN < span / n < _MOST_TURNS)
 
 
 def counting_alike(positions: Sequence[Reading], machine: Machine) -> list[Reading]:
@@ -126,7 +132,7 @@ def counting_alike(positions: Sequence[Reading], machine: Machine) -> list[Readi
     out = []
     for reading in positions:
         scales = tuple(scale for scale in reading.scales if scale in left.get(stem(reading), ()))
-        alike = replace(reading, unit=scales[0].unit, factor=scales[0].factor, scales=scales) if scales else reading
+        alike = replace(reading, scales=scales).read_as(scales[0]) if scales else reading
         out.append(alike)
     return out
 

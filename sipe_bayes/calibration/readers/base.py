@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -95,6 +95,11 @@ def spread(name: str, values: NDArray[np.generic], labels: Sequence[str] = ()) -
     width = values.shape[1]
     words = labels if len(set(labels)) == len(labels) == width else range(width)
     return {f"{name}[{word}]": plain(values[:, j]) for j, word in enumerate(words)}
+
+
+def spread_all(arrays: Iterable[tuple[str, NDArray[np.generic]]]) -> Columns:
+    """The columns of several arrays by their names."""
+    return {word: column for name, values in arrays for word, column in spread(name, values).items()}
 
 
 def frame_columns(frame: pandas.DataFrame) -> Columns:

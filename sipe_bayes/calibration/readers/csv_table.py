@@ -1,15 +1,23 @@
-"""Tables of text, separated by comma, semicolon, tab or blanks; the first line that is no remark names the columns."""
+"""Tables of text, separated by comma, semicolon, tab or blanks; the first line that is no remark names the columns.
+
+Cells that hold a list, ``"[0.1, 0.2]"``, are columns of their own, ``q[0]`` and ``q[1]``.
+"""
 
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Collection
 from pathlib import Path
 from typing import Literal, TextIO
 
-from sipe_bayes.calibration.readers.base import Columns, LogError, check_size, frame_columns
+import numpy as np
+from numpy.typing import NDArray
+
+from sipe_bayes.calibration.readers.base import Columns, LogError, check_size, frame_columns, spread_all
 
 _LONGEST = 2**17  # characters of a header or a name: what the csv module takes
+_DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:")
 _REMARKS = 200  # lines above the header that are looked through
 
 
@@ -40,7 +48,32 @@ def read_csv(path: Path, wanted: Collection[str]) -> Columns:
         encoding="utf-8-sig",
         float_precision=_float_precision(pd.__version__),
     )
-    return frame_columns(frame)
+    return spread_all((name, _rows(cells)) for name, cells in frame_columns(frame).items())
+
+
+def _rows(cells: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Lists in cells (n,) as an array (n, k), NaN where one is blank; other cells as they are."""
+    if cells.dtype.kind == "O" and len(cells) and _DATE.match(str(cells[0])):
+        return _seconds(cells)
+    if cells.dtype.kind != "O" or not all(cell != cell or str(cell).strip()[:1] in ("[", "(") for cell in cells):
+        return cells
+    rows = [None if cell != cell else str(cell).strip(" [()]").replace(",", " ").split() for cell in cells]
+    width = max((len(row) for row in rows if row is not None), default=0)
+    try:
+        return np.array([[np.nan] * width if row is None else row for row in rows], dtype=np.float64)
+    except ValueError:
+        return cells
+
+
+def _seconds(cells: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Dates and times (n,) of ISO 8601 in s since 1970; other text as it is."""
+    import pandas as pd
+
+    try:
+        times = pd.to_datetime(pd.Series(cells), format="ISO8601", utc=True)
+    except ValueError:
+        return cells
+    return np.asarray((times - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1), dtype=np.float64)
 
 
 def _opening(file: TextIO) -> tuple[int, str, str]:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sipe_bayes.calibration.readers.base import Columns, LogError, check_size, largest, spread
+from sipe_bayes.calibration.readers.base import Columns, LogError, check_size, largest, spread, spread_all
 
 _HEADER = 128  # bytes before the first element
 _MATRIX, _COMPRESSED = 14, 15  # types of elements
@@ -47,11 +47,7 @@ def _version_5(path: Path) -> tuple[Columns, list[str]]:
     objects = [name for name, kind in kinds.items() if kind in _OBJECTS]
     names = [name for name in kinds if name and name not in objects]
     variables = loadmat(path, variable_names=names, simplify_cells=True) if names else {}
-    columns: Columns = {}
-    for name in names:
-        for word, values in _leaves(name, variables.get(name), 0):
-            columns.update(spread(word, values))
-    return columns, objects
+    return spread_all(leaf for name in names for leaf in _leaves(name, variables.get(name), 0)), objects
 
 
 def _leaves(name: str, value: object, depth: int) -> Iterator[tuple[str, NDArray[np.generic]]]:
@@ -62,10 +58,17 @@ def _leaves(name: str, value: object, depth: int) -> Iterator[tuple[str, NDArray
         for field, inner in value.items():
             yield from _leaves(f"{name}.{field}", inner, depth + 1)
     elif isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object and value.ndim == 1):
-        for i, inner in enumerate(value):
+        rows = all(isinstance(row, dict) and not any(map(_is_many, row.values())) for row in value)
+        for field in value[0] if rows and len(value) else ():
+            yield from _leaves(f"{name}.{field}", np.array([row[field] for row in value]), depth)
+        for i, inner in enumerate(() if rows else value):
             yield from _leaves(f"{name}[{i}]", inner, depth + 1)
     elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         yield name, value
+
+
+def _is_many(value: object) -> bool:
+    return isinstance(value, dict | list | np.ndarray)
 
 
 def _variables(path: Path) -> Iterator[tuple[str, int]]:

@@ -10,6 +10,8 @@ from sipe_bayes.calibration.config_fields import nearest_file
 from sipe_bayes.calibration.readers.base import Columns, Format, LogError
 from sipe_bayes.calibration.readers.csv_table import read_csv
 from sipe_bayes.calibration.readers.hdf5_file import read_hdf5
+from sipe_bayes.calibration.readers.joined import JOINTS, read_joined
+from sipe_bayes.calibration.readers.json_file import read_json_log
 from sipe_bayes.calibration.readers.lerobot import INFO, read_lerobot
 from sipe_bayes.calibration.readers.matlab import read_matlab
 from sipe_bayes.calibration.readers.npz_arrays import read_npz
@@ -34,6 +36,7 @@ READERS: dict[str, Format] = {
     ".txt": _TEXT,
     ".parquet": Format(read_parquet, "as there; entries of lists `state[0]`"),
     ".npz": Format(read_npz, "as its array; of two dimensions, where rows are samples, `states[0]` and so on"),
+    ".json": Format(read_json_log, "as in its rows, behind what they are below: `position`, `log.q`, `episodes[0].q`"),
     ".h5": _HDF5,
     ".hdf5": _HDF5,
     ".mat": Format(
@@ -42,6 +45,9 @@ READERS: dict[str, Format] = {
     ),
     INFO: Format(
         read_lerobot, "LeRobot, v2 and v3: `observation.state[shoulder]`; time `timestamp`, episodes `episode_index`"
+    ),
+    JOINTS: Format(
+        read_joined, "of CSV files in one folder, whose lists have the names of joints: `control.positions[elbow]`"
     ),
     ".mcap": _BAG,
     ".db3": _BAG,
@@ -90,6 +96,9 @@ def _kind(path: Path) -> str:
         return inner
     if not is_file(path):
         raise LogError(f"{path}: no such file; {nearest_file(path)}")
+    if path.suffix.lower() in (".pt", ".pth", ".pkl", ".pickle"):
+        export = "`numpy.savez('log.npz', **{name: numpy.asarray(x) for name, x in data.items()})`"
+        raise LogError(f"{path}: is a pickle, which could run anything and is not loaded; where it was made: {export}")
     if path.suffix.lower() not in READERS:
         suffixes = _one_of(kind for kind in READERS if kind.startswith("."))
         raise LogError(f"{path}: expected a {suffixes} file, got {path.suffix!r}; convert it")

@@ -1,4 +1,4 @@
-"""MJCF of a path or a text as MjSpec and MjModel: what is wrong with it is one line."""
+"""MJCF or URDF of a path or MJCF of a text as MjSpec and MjModel: what is wrong with it is one line."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import mujoco
 from sipe_bayes.core.files import LineError, is_file
 from sipe_bayes.envs.foreign.quiet import quiet
 from sipe_bayes.envs.foreign.trial import refusal
+from sipe_bayes.envs.foreign.urdf import parsed
 
 LEAST_TIMESTEP = 1e-6
 """Seconds of a physics step: a shorter one gives a control step more physics than anybody waits for."""
@@ -34,7 +35,7 @@ def load_spec(source: str) -> mujoco.MjSpec:
         raise ModelError(f"model: {source} {why}")
     try:
         with quiet:
-            return mujoco.MjSpec.from_string(source) if text else mujoco.MjSpec.from_file(source)
+            return mujoco.MjSpec.from_string(source) if text else parsed(Path(source))
     except ValueError as error:
         raise ModelError(f"model: {_where(source)} is not valid MJCF: {_line(error)}; correct it") from None
 

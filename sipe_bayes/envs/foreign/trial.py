@@ -149,10 +149,11 @@ def _main(path: str, seconds: str, gib: str) -> None:
     import mujoco
 
     from sipe_bayes.envs.foreign.quiet import quiet
+    from sipe_bayes.envs.foreign.urdf import parsed
 
     try:
         with quiet:
-            model = mujoco.MjSpec.from_file(path).compile()
+            model = parsed(Path(path)).compile()
             data = mujoco.MjData(model)
             for _ in range(_STEPS):
                 mujoco.mj_step(model, data)

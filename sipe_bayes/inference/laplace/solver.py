@@ -214,8 +214,8 @@ class SegmentSolver:
         return (windows.num_theta + windows.num_start + len(_DAMPINGS) + 1) * len(windows.trajectories)
 
     def start(self) -> SolverState:
-        """The first state: at the model as given, or at the starting point that the options name."""
-        options, nominal = self.problem.options, np.clip(self.problem.space.default_theta, 0, 1)
+        """The first state: where the priors expect it, or at the starting point that the options name."""
+        options, nominal = self.problem.options, np.clip(self.problem.space.expected_theta, 0, 1)
         residual, valid = None, True
         if options.initial is not None:
             points = options.initial

@@ -19,10 +19,11 @@ from sipe_bayes.calibration.logs import load_logs
 from sipe_bayes.calibration.readers.base import LogError
 from sipe_bayes.calibration.readers.ros_messages import Message
 from sipe_bayes.calibration.readers.tables import read_table
+from tests.calibration.readers.files import OTHERS
 from tests.problems.log_files import WRITERS, Table, Written, configured, lerobot_folder, matlab_7_3_file
 from tests.problems.log_tables import load, regular
 
-ALL: dict[str, Callable[[Path, Table], Written]] = {**WRITERS, "MATLAB 7.3": matlab_7_3_file}
+ALL: dict[str, Callable[[Path, Table], Written]] = {**WRITERS, **OTHERS, "MATLAB 7.3": matlab_7_3_file}
 CASES = 40  # of each format; a longer run has more
 
 

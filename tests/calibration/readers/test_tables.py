@@ -10,11 +10,12 @@ import pytest
 from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.calibration.readers.base import Columns, Format, LogError
 from sipe_bayes.calibration.readers.tables import READERS, read_table
+from tests.calibration.readers.files import OTHERS
 from tests.problems.log_files import WRITERS, Table, Written, configured, csv_file, lerobot_folder, matlab_7_3_file
 from tests.problems.log_tables import regular
 
 ALL = {
-    **{kind: WRITERS.get(kind) for kind in READERS},
+    **{kind: {**WRITERS, **OTHERS}.get(kind) for kind in READERS},
     "MATLAB 7.3": matlab_7_3_file,
     "LeRobot 3": lambda folder, table: lerobot_folder(folder, table, "v3.0"),
 }
@@ -24,7 +25,7 @@ ALL = {
 def test_every_format_gives_the_trajectory_of_the_csv(kind: str, tmp_path: Path) -> None:
     """A format of the registry without a writer fails: a reader comes with a file that it reads."""
     write: Callable[[Path, Table], Written] | None = ALL[kind]
-    assert write is not None, f"{kind}: no writer in tests/problems/log_files.py"
+    assert write is not None, f"{kind}: no writer in tests/problems/log_files.py or files.py"
     table = regular(80)
     table["q"][7] = 1 / 3
     plain = configured(csv_file(tmp_path, table), tmp_path)
@@ -76,7 +77,9 @@ def test_a_missing_package_is_named_with_its_command(
 
 
 def test_a_folder_that_is_no_log(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match=r"a folder without meta/info.json or metadata.yaml; name the log's file"):
+    with pytest.raises(
+        LogError, match=r"a folder without meta/info.json, joint_list.txt or metadata.yaml; name the log's file"
+    ):
         read_table(tmp_path)
 
 

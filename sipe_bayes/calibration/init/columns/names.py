@@ -111,6 +111,8 @@ def read_name(column: str, own: Collection[str] = ()) -> Label:
     parts = len(_PIECE.findall(last))
     if not unit and 1 < parts < len(words) and last.lower() in UNITS:  # mA, mNm, kN
         unit, words = UNITS[last.lower()], words[:-parts]
+    if not unit and words[-1:] == ["grad"] and ANGLES & {*words[:-1]}:  # German for degrees
+        unit, words = "deg", words[:-1]
     if not unit and len(words) > 1:
         for length in (3, 2, 1):  # rad_per_s, rad_s, rad
             if len(words) > length and not _called(words, length, own) and (word := _unit_of(words[-length:])):
@@ -337,9 +339,10 @@ def is_accelerometer(label: Label, stem: str) -> bool:
     return label.kind == Kind.ACCELERATION and (_speaks(stem, "acc", "linear") or _ends(stem, "a"))
 
 
-def is_turn(label: Label, stem: str) -> bool:
-    """Whether it is a quaternion's."""
-    return label.kind == Kind.QUATERNION or (label.number is not None and _speaks(stem, "quat", "orientation"))
+def is_turn(label: Label, stem: str, alone: bool = False) -> bool:
+    """Whether it is a quaternion's; alone: q[0] to q[3] of a machine without joints are one too."""
+    spelt = _speaks(stem, "quat", "orientation") or (alone and pieces_of(stem)[-1:] == ["q"])
+    return label.kind == Kind.QUATERNION or (label.number is not None and spelt)
 
 
 def is_spin(label: Label, stem: str) -> bool:

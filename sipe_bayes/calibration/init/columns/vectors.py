@@ -61,8 +61,9 @@ def _wanted(machine: Machine) -> list[Wanted]:
         (is_gyro if kind == "gyro" else is_accelerometer, 3, partial(_sensor, name)) for name, kind in machine.sensors
     ]
     if machine.bodies:
-        out.append((is_turn, 4, partial(_body, machine, "orientation")))
-        out.append((lambda x, s: x.kind == Kind.POSITION and not is_turn(x, s), 3, partial(_body, machine, "position")))
+        turns = partial(is_turn, alone=not machine.joints)
+        out.append((turns, 4, partial(_body, machine, "orientation")))
+        out.append((lambda x, s: x.kind == Kind.POSITION and not turns(x, s), 3, partial(_body, machine, "position")))
         out.append((is_spin, 3, partial(_body, machine, "angular_velocity")))
         out.append(
             (lambda x, s: x.kind == Kind.VELOCITY and not is_spin(x, s), 3, partial(_body, machine, "linear_velocity"))

@@ -12,8 +12,10 @@ from sipe_bayes.calibration.init.draft import Unknown, rounded_up
 from sipe_bayes.calibration.init.machine import Machine, Sizes
 from sipe_bayes.calibration.init.regression import Outcome, Regression
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.envs.targets import bind
 
-_ROOM = 4.0  # times what a regression says, either way: what the model lacks is in it too
+_ROOM, _FAR = 4.0, 10.0  # times what a regression says of friction, and of gains: what the model lacks is in it too
 _SURE = 3.0  # standard errors, from which a gain is believed
 _GAINS = ("kp", "gain", "resistance", "motor_constant")
 
@@ -38,19 +40,23 @@ def sizes_of(model: mujoco.MjModel, machine: Machine, regression: Regression, ou
 def informed(
     model: mujoco.MjModel, unknowns: Sequence[Unknown], regression: Regression, outcome: Outcome
 ) -> tuple[list[Unknown], dict[str, float]]:
-    """The unknowns with bounds that hold what the regression says, and these values, of bounds' kind, by name."""
+    """The unknowns with bounds that hold what the regression says, and these values, SI, by name."""
     values: dict[str, float] = {}
     out = []
-    gains = {model.actuator(a).name: (g, e) for a, g, e in zip(regression.actuators, *_told(outcome), strict=True)}
+    told = {
+        model.actuator(a).name: (float(g), float(e))
+        for a, g, e in zip(regression.actuators, outcome.gains, outcome.errors, strict=True)
+    }
     for unknown in unknowns:
         owner, _, field = unknown.targets[0].rpartition(".")
         kind, _, name = owner.partition(":")
-        if kind == "actuator" and field in _GAINS and unknown.relative and name in gains:
-            gain, error = gains[name]
+        if kind == "actuator" and field in _GAINS and unknown.relative and name in told:
+            gain, error = told[name]
             if gain > _SURE * error:
                 gain = 1 / gain if field == "resistance" else gain
-                values[unknown.name] = gain
-                unknown = _around_gain(unknown, gain)
+                own = bind(model, unknown.targets[0]).value
+                values[unknown.name] = gain * own
+                unknown = _around_gain(unknown, gain, own)
         elif kind == "joint" and field in ("damping", "frictionloss") and not unknown.relative:
             dof = int(model.joint(name).dofadr[0])
             if regression.known[dof]:
@@ -61,26 +67,18 @@ def informed(
     return out, values
 
 
-def _told(outcome: Outcome) -> tuple[FloatArray, FloatArray]:
-    return outcome.gains, outcome.errors
-
-
-def _around_gain(unknown: Unknown, gain: float) -> Unknown:
-    """Factors around what the logs say, with the model's own at most at an end."""
-    if unknown.low < gain < unknown.high:
+def _around_gain(unknown: Unknown, gain: float, own: float) -> Unknown:
+    """Bounds around what the logs say, with the model's own value at most at an end."""
+    if unknown.low < gain < unknown.high or own <= 0:
         return unknown
-    low, high = min(gain / _ROOM, 1.0), max(gain * _ROOM, 1.0)
-    note = f"{unknown.note}; the logs say about {gain:.2g} times that"
-    return replace(unknown, low=float(f"{low:.2g}"), high=rounded_up(high), note=note)
+    low, high = min(gain / _FAR, 1.0) * own, max(gain * _FAR, 1.0) * own
+    note = f"{unknown.note}; the logs say about {gain * own:.2g}"
+    low, high, told = float(f"{low:.2g}"), rounded_up(high), float(f"{gain * own:.3g}")
+    return replace(unknown, low=low, high=high, relative=False, note=note, expected=told)
 
 
-def started(
-    names: Sequence[str], unknowns: Sequence[Unknown], given: FloatArray, values: dict[str, float]
-) -> FloatArray:
+def started(space: ParameterSpace, values: dict[str, float]) -> FloatArray:
     """Theta (N,) of the model's own values, and of what the regression says where it does."""
-    theta = given.copy()
-    for unknown in unknowns:
-        if unknown.name in values and unknown.name in names:
-            share = (values[unknown.name] - unknown.low) / (unknown.high - unknown.low)
-            theta[list(names).index(unknown.name)] = float(np.clip(share, 0.0, 1.0))
-    return theta
+    given = space.default_theta
+    own = [p.normalise(values[p.name]) if p.name in values else x for p, x in zip(space, given, strict=True)]
+    return np.clip(np.array(own, float), 0.0, 1.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -242,7 +243,8 @@ def as_parameters(model: mujoco.MjModel, unknowns: Sequence[Unknown]) -> list[Pa
         low, high = unknown.low, unknown.high
         if own is not None:
             low, high = min(low, own), max(high, own)
-        out.append(Parameter(unknown.name, low, high, targets=unknown.targets))
+        scale: Literal["linear", "log"] = "linear" if unknown.expected is None else "log"
+        out.append(Parameter(unknown.name, low, high, scale=scale, targets=unknown.targets))
     return out
 
 

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import scipy.optimize
 
+from sipe_bayes.calibration.init.decisions import DECIDED
 from sipe_bayes.calibration.init.draft import Unknown, rounded_up
 from sipe_bayes.calibration.init.regression import Outcome, Regression, turning_of
 from sipe_bayes.core.arrays import FloatArray
@@ -99,14 +100,19 @@ def delay_of(
     """The delay as an unknown where one shows, and what is to be said of it; dt in s."""
     if not actuators or len(delays) < 2 or not len(outcome.behind) or not outcome.behind.any():
         return [], ""
+    targets = tuple(f"actuator:{name}.delay" for name in actuators)
     best, behind = delays[int(np.argmin(outcome.behind))], count * float(outcome.behind[0])
-    if not best or behind < _SHOWN:
+    may = [d for d, x in zip(delays, count * outcome.behind, strict=True) if x < DECIDED]
+    if not best and len(may) == 1:
         return [], "commands arrive at once: a delay would not explain more of the joints' forces"
+    if not best or behind < _SHOWN:
+        latest = delays[min(delays.index(may[-1]) + 1, len(delays) - 1)]
+        note = f"commands may be up to {1e3 * dt * may[-1]:.3g} ms late: these logs hardly tell"
+        return [Unknown("delay", targets, 0.0, rounded_up(dt * latest), False, note)], note
     if best == delays[-1]:
         why = "which other things than a delay do as well: look at the model and at what drives it; none is asked for"
         return [], f"the later commands arrive the better, up to the {1e3 * dt * best:.3g} ms that were tried, {why}"
     high = rounded_up(dt * max(2 * best, best + 3))
-    targets = tuple(f"actuator:{name}.delay" for name in actuators)
     when = f"{1e3 * dt * outcome.delay:.3g} ms late, {outcome.delay:.2g} samples"
     note = f"commands arrive about {when}: {behind:.2g} nats more than without a delay"
     return [Unknown("delay", targets, 0.0, high, False, note)], note  # none at all is what the model has
