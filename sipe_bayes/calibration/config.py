@@ -214,7 +214,7 @@ def _episodes(path: Path, config: Config) -> tuple[LogEntry, ...]:
                 raise ConfigError(f"{path}: key `logs[{i}].episodes`: needs `columns.episode`; name the column there")
             logs.append(log)
             continue
-        numbers = episodes_of(log.file, column) if log.episodes is None else log.episodes
+        numbers = episodes_of(log.file, column, config.columns.names) if log.episodes is None else log.episodes
         own = log.episodes is not None and len(log.episodes) == 1 and log.name != log.file.stem
         names = [log.name if own else f"{log.name}-{n}" for n in numbers]
         logs += [

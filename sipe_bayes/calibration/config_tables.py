@@ -51,6 +51,8 @@ class Columns(Table):
     """Columns that are neither command nor measurement."""
 
     time: TimeColumn = TimeColumn()
+    names: tuple[Text, ...] = ()
+    """what the columns of a CSV without a header are called, in their order"""
     episode: Text | None = None
     """column that numbers the episodes of a file, each of which is then a log of its own; `"data/demo_*"` for numbered
     groups of HDF5, `"runs[*]"` for cells of MATLAB"""

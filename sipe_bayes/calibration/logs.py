@@ -107,7 +107,7 @@ class _Opened:
     @classmethod
     def of(cls, file: Path, wanted: Sequence[str], named: Named) -> _Opened:
         episode = named.episode
-        table = with_clock(read_table(file, wanted), named.time.column, named.time.rate)
+        table = with_clock(read_table(file, wanted, named.names), named.time.column, named.time.rate)
         return cls(table, digest(file), None if episode is None else episode_numbers(file, table, episode))
 
 

@@ -65,7 +65,7 @@ def validate_config(path: Path) -> Validated:
     model = compile_spec(load_spec(str(config.model)), str(config.model))
     machine = Machine.of(model)
     train = sorted(config.logs_for("train"), key=lambda log: bool(log.added))[:_LOGS]  # with a load, another machine
-    opened = open_table(train[0].file, read_table(train[0].file), config.columns.time.rate)
+    opened = open_table(train[0].file, read_table(train[0].file, (), config.columns.names), config.columns.time.rate)
     draft = _draft_of(config, opened, folder)
     part = tried_part(draft)
     part = replace(part, unknowns=tuple(rough_unknowns(model, machine, draft.readings)))
@@ -119,6 +119,7 @@ def _draft_of(config: Config, opened: Opened, folder: Path) -> Draft:
         tuple(reading(m, m.sources) for m in config.measurements),
         (LogLine(str(config.logs[0].file.resolve())),),
         "log",
+        names=config.columns.names,
     )
 
 

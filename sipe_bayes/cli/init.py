@@ -18,6 +18,7 @@ def init(
     logs: Annotated[list[Path] | None, typer.Argument(help="Logs: files, folders or patterns.")] = None,
     out: Annotated[Path, typer.Option(help="The configuration to write.")] = Path("calibrate.toml"),
     rate: Annotated[float | None, typer.Option(min=1e-3, help="Hz of the rows, of logs without a clock.")] = None,
+    columns: Annotated[str, typer.Option(help="Names of the columns, of logs without a header: t,q,dq,tau.")] = "",
     force: Annotated[bool, typer.Option("--force", help="Overwrite it.")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: what is open stays as proposed.")] = False,
     plot: Annotated[bool, typer.Option("--plot", help="Draw the matched columns into NAME.png.")] = False,
@@ -36,7 +37,8 @@ def init(
         from sipe_bayes.envs.foreign.named import model_file
 
         with ProgressBar(unit="configuration", counted=False) as progress:
-            draft = propose(model_file(model), logs, out.parent, rate, lambda what: progress(what, 0, 1))
+            names = tuple(name.strip() for name in columns.split(",")) if columns else ()
+            draft = propose(model_file(model), logs, out.parent, rate, lambda what: progress(what, 0, 1), names)
         if not yes and sys.stdin.isatty() and sys.stdout.isatty():
             draft = asked(draft, _ask)
         write_text(out, toml_of(draft, command_line()))

@@ -212,6 +212,7 @@ class Draft:
         delay: of the commands, in samples.
         seconds: that a calibration may take; 0 where nothing says it.
         together: columns that may be turned round together, in groups.
+        names: of columns without a header.
     """
 
     model: str
@@ -229,6 +230,7 @@ class Draft:
     delay: float = 0.0
     seconds: float = 0.0
     together: tuple[tuple[str, ...], ...] = ()
+    names: tuple[str, ...] = ()
 
     @property
     def readings(self) -> tuple[Reading, ...]:
@@ -255,6 +257,7 @@ class Draft:
         """The configuration that it stands for; paths are relative to the folder."""
         columns: Row = {"time": self.clock.row}
         columns |= {"episode": self.episode} if self.episode else {}
+        columns |= {"names": list(self.names)} if self.names else {}
         data: Row = {
             "model": self.model,
             **self.likelihood,

@@ -67,7 +67,12 @@ _SHORT = 2.0  # s: logs as short are one window each
 
 
 def propose(
-    model_path: Path, logs: Sequence[Path], folder: Path, rate: float | None = None, tell: Tell = silent
+    model_path: Path,
+    logs: Sequence[Path],
+    folder: Path,
+    rate: float | None = None,
+    tell: Tell = silent,
+    columns: tuple[str, ...] = (),
 ) -> Draft:
     """A configuration for a model and its logs.
 
@@ -77,6 +82,7 @@ def propose(
         folder: of the configuration, to which its paths are relative.
         rate: Hz, of logs without a clock.
         tell: called with what is being done.
+        columns: names, of logs without a header.
 
     Raises:
         ModelError: for a model that does not compile.
@@ -87,7 +93,7 @@ def propose(
     model = compile_spec(spec, str(model_path))
     machine = Machine.of(model)
     files = _files(logs)
-    opened, others = richest([files[i] for i in _spread(len(files))], rate)
+    opened, others = richest([files[i] for i in _spread(len(files))], rate, columns)
     matches = match_columns(machine, opened.columns)
     _check_some(machine, matches, opened, files[0])
     tables = [one.columns for one in (opened, *others)]
@@ -101,7 +107,7 @@ def propose(
             *_unmatched(model, machine, matches, commands),
         ),
         notes=tuple(nameless(model, {model.body(body).id for body in machine.bodies})),
-        unused=_unused(matches, commands),
+        unused=_unused(matches, commands), names=columns,
     )  # fmt: skip
     positions = bool(tried_part(draft).measurements)
     with threadpool_limits(1):  # all matrices are small
@@ -245,13 +251,13 @@ def _split(
     wanted = [c for reading in (*measurements, *commands) for c in reading.match.columns]
     kept, lost = [files[0]], []
     for file in files[1:]:
-        if len(kept) > _CHECKED or not [c for c in wanted if c not in read_table(file, starred(wanted))]:
+        if len(kept) > _CHECKED or not [c for c in wanted if c not in read_table(file, starred(wanted), opened.names)]:
             kept.append(file)
         else:
             lost.append(file.name)
     notes = [f"left out, for they lack columns: {', '.join(lost[:6])}"] if lost else []
     if opened.episodes is not None:
-        return (*_episodes(kept, opened.episodes, folder), notes)
+        return (*_episodes(kept, opened.episodes, folder, opened.names), notes)
     if len(kept) == 1:
         cut = _HELD * opened.seconds
         name, only = kept[0].stem, _relative(kept[0], folder)
@@ -269,11 +275,13 @@ def _split(
     return lines, [Source(train_files[i]) for i in _spread(len(train_files))], notes
 
 
-def _episodes(files: Sequence[Path], column: str, folder: Path) -> tuple[tuple[LogLine, ...], list[Source]]:
+def _episodes(
+    files: Sequence[Path], column: str, folder: Path, names: Sequence[str]
+) -> tuple[tuple[LogLine, ...], list[Source]]:
     """Episodes of files: of each the last fifth is held out."""
     lines, sources = [], []
     for file in files:
-        numbers = episodes_of(file, column)
+        numbers = episodes_of(file, column, names)
         held = max(1, len(numbers) // 5)
         path = _relative(file, folder)
         lines.append(LogLine(path, "train", f"{file.stem}-train", None, tuple(numbers[:-held])))

@@ -54,7 +54,8 @@ class Clock:
 class Opened:
     """A log: its clock, what numbers its episodes, its columns (n,) on one clock, and how long it is in s.
 
-    Columns that do not change are none of these; of those in kg, as of a load, ``weights`` has the value.
+    Columns that do not change are none of these; of those in kg, as of a load, ``weights`` has the value. What columns
+    without a header are called is given in ``names``.
     """
 
     clock: Clock
@@ -62,6 +63,7 @@ class Opened:
     columns: Mapping[str, FloatArray]
     seconds: float
     weights: Mapping[str, float]
+    names: tuple[str, ...] = ()
 
 
 def open_table(path: Path, table: Columns, rate: float | None = None) -> Opened:
@@ -85,13 +87,15 @@ def open_table(path: Path, table: Columns, rate: float | None = None) -> Opened:
     return Opened(clock, episodes, _together(numbers, clock, episodes), seconds, weights)
 
 
-def richest(files: Sequence[Path], rate: float | None = None) -> tuple[Opened, list[Opened]]:
+def richest(
+    files: Sequence[Path], rate: float | None = None, columns: tuple[str, ...] = ()
+) -> tuple[Opened, list[Opened]]:
     """The log by whose columns quantities are looked for, and the others.
 
     That is the one in which most of the first one's columns change: a joint may stand still in one motion of several.
     """
-    names = {*read_table(files[0])}
-    opened = [open_table(file, read_table(file), rate) for file in files]
+    names = {*read_table(files[0], (), columns)}
+    opened = [replace(open_table(file, read_table(file, (), columns), rate), names=columns) for file in files]
     alike = [opened[0], *(one for one in opened[1:] if names.issuperset(one.columns))]
     most = max(alike, key=lambda one: len(one.columns))
     return most, [one for one in opened if one is not most]

@@ -28,6 +28,7 @@ def toml_of(draft: Draft, command: str) -> str:
     text += "\n[columns]\n" + "".join(f"{_open(clock.doubt)}\n" for _ in range(bool(clock.doubt)))
     text += to_toml({"row": [{"time": clock.row}]}).splitlines()[1] + f" # {printed(clock.why)}\n"
     text += f"episode = {_string(draft.episode)}\n" if draft.episode else ""
+    text += to_toml({"names": list(draft.names)}) if draft.names else ""
     blocks = [_reading("commands", reading) for reading in draft.commands]
     blocks += [_reading("measurements", reading) for reading in draft.measurements]
     if len(draft.logs) < _INLINE:

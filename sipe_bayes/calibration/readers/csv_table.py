@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Literal, TextIO
 
@@ -21,8 +21,8 @@ _DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:")
 _REMARKS = 200  # lines above the header that are looked through
 
 
-def read_csv(path: Path, wanted: Collection[str]) -> Columns:
-    """The columns; a comma is the decimal sign where semicolons separate."""
+def read_csv(path: Path, wanted: Collection[str], given: Sequence[str] = ()) -> Columns:
+    """The columns; a comma is the decimal sign where semicolons separate. Those without a header have given names."""
     import pandas as pd
 
     check_size(path, path.stat().st_size)
@@ -32,8 +32,16 @@ def read_csv(path: Path, wanted: Collection[str]) -> Columns:
         raise LogError(f"{path}: the first line is longer than {_LONGEST} characters; is it a table of columns?")
     separator = _separator(header)
     names = [name.strip() for name in _split(header.lstrip("#% "), separator)]
-    if any(_is_number(name) for name in names):
-        raise LogError(f"{path}: the first line must name the columns, got {header[:40]!r}; add a header line")
+    if given:
+        above, first = (above, first) if header.lstrip()[:1] in ("#", "%") else (above - 1, header)
+        if not _is_row(first) or _width(first) != len(given):
+            is_given = f"{len(given)} names are given for a table without a header"
+            raise LogError(f"{path}: {is_given}, its first row is {first[:40]!r}; correct `columns.names`, or drop it")
+        separator, names = _separator(first), list(given)
+    elif any(_is_number(name) for name in names):
+        raise LogError(
+            f"{path}: the first line must name the columns, got {header[:40]!r}; add such a line, or --columns t,q,..."
+        )
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise LogError(f"{path}: column {twice[0]!r} appears more than once; rename one of them")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import hashlib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -42,9 +42,9 @@ def names_of(paths: list[Path]) -> list[str]:
     return ["-".join(part[same:]) for part in parts]
 
 
-def episodes_of(path: Path, column: str) -> list[int]:
+def episodes_of(path: Path, column: str, names: Sequence[str] = ()) -> list[int]:
     """The numbers of the episodes in a file, in the order in which they begin; raises LogError where it has none."""
-    numbers = episode_numbers(path, read_table(path, [column]), column)
+    numbers = episode_numbers(path, read_table(path, [column], names), column)
     distinct = np.unique(numbers, return_index=True)
     episodes = [int(number) for number in distinct[0][np.argsort(distinct[1])]]
     if 2 * len(episodes) > len(numbers):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 from sipe_bayes.calibration.config_fields import nearest_file
@@ -57,12 +57,13 @@ READERS: dict[str, Format] = {
 """The one list of formats: by the suffix of a file, or by the file that tells what a folder is."""
 
 
-def read_table(path: str | Path, wanted: Collection[str] = ()) -> Columns:
+def read_table(path: str | Path, wanted: Collection[str] = (), names: Sequence[str] = ()) -> Columns:
     """The columns of a log's file by name.
 
     Args:
         path: a file with a suffix of ``READERS``, or a folder with one of its files.
         wanted: columns that will be asked for; none for all. With ``*``, those of numbered episodes together.
+        names: of the columns of a table of text without a header; none for one that has them.
 
     Returns:
         The columns, each (n,); they may differ in length.
@@ -72,10 +73,12 @@ def read_table(path: str | Path, wanted: Collection[str] = ()) -> Columns:
     """
     path = Path(path)
     kind = _kind(path)
+    if names and READERS[kind] is not _TEXT:
+        raise LogError(f"{path}: `columns.names` is for a CSV without a header; drop it")
     try:
         with warnings.catch_warnings(), reading(path, kind, READERS[kind].remedy, LogError):
             warnings.simplefilter("ignore")
-            columns = READERS[kind].read(path, wanted)
+            columns = read_csv(path, wanted, names) if names else READERS[kind].read(path, wanted)
     except ModuleNotFoundError as error:
         needs = f"needs the package {error.name}, which is not installed"
         raise LogError(f"{path}: {needs}: pip install 'sipe-bayes[{READERS[kind].extra}]'") from None

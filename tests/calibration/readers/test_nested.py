@@ -119,3 +119,17 @@ def test_rows_of_a_matlab_struct(tmp_path: Path) -> None:
     rows = np.array([(0.0, 1.0, "a"), (0.1, 2.0, "b")], dtype=[("t", "f8"), ("q", "f8"), ("word", object)])
     savemat(tmp_path / "x.mat", {"log": rows, "vir": np.arange(2.0)})
     assert columns(tmp_path / "x.mat") == {"log.t": [0.0, 0.1], "log.q": [1.0, 2.0], "vir": [0.0, 1.0]}
+
+
+@pytest.mark.parametrize("text", ["0,1\n1,2\n", "# made by a logger\n0,1\n1,2\n", "0 1\n1 2\n"])
+def test_names_of_a_table_without_a_header(text: str, tmp_path: Path) -> None:
+    path, names = tmp_path / "x.csv", ("t", "q")
+    path.write_text(text)
+    assert str({k: v.tolist() for k, v in read_table(path, (), names).items()}) == "{'t': [0, 1], 'q': [1, 2]}"
+    with pytest.raises(LogError, match=r"3 names are given for a table without a header, its first row is '0"):
+        read_table(path, (), (*names, "u"))
+    path.write_text("t,q\n0,1\n")
+    with pytest.raises(LogError, match="2 names are given for a table without a header, its first row is 't,q'"):
+        read_table(path, (), names)
+    with pytest.raises(LogError, match=r"`columns.names` is for a CSV without a header"):
+        read_table(path.rename(tmp_path / "x.json"), (), names)
