@@ -44,7 +44,7 @@ _LATEST = 0.3  # s, of a position behind its set-point
 _USELESS = 0.9  # of the forces, what is left where the model explains nothing
 _OUTSIDE, _BEYOND = 6.0, 0.1  # nats against samples beyond a joint's range, by a share of which it may be off
 _NEAR, _FAR = np.log(3.0), np.log(5.0)  # of the logarithm of a ratio: the same; another unit, or a model far off
-_ZEROS, _FINER = 17, 9  # zeros that are tried over the range of a joint, and around the best
+_ZEROS, _FINER = 11, 9  # zeros that are tried over the range of a joint, and around the best
 _ZERO_GAIN, _LEAST_ZERO = 6.0, 0.05  # nats and rad or m, from which a zero is believed
 _TIMES = 1.5  # of what is left, from which a frame is another one
 _WELL = 0.1  # of the forces, up to which no other frame is tried
@@ -103,11 +103,7 @@ class Case:
                 driven[command] *= factor
         assumption = Assumption(tuple(observed), tuple(driven), tuple(zeros) if any(zeros) else (), self.minus)
         if assumption not in self._known:
-            late = None
-            if self._known:  # of the first one's delays
-                behind = next(iter(self._known.values())).behind
-                late = sorted({0, min(1, len(behind) - 1), int(np.argmin(behind))})
-            self._known[assumption] = self.regression.fit(assumption, late)
+            self._known[assumption] = self.regression.fit(assumption, every=False)
         return self._known[assumption]
 
     def nats(self, outcome: Outcome) -> float:
@@ -271,9 +267,8 @@ def _with_tied(case: Case, readings: Readings, tied: dict[int, tuple[int, float]
         if own.scale in (*own.shares, *own.scales) and abs(np.log(raw)) < _NEAR and not out[k].match.label.unit:
             out[k] = replace(out[k], scales=own.scales, shares=own.shares, reach=own.reach).read_as(own.scale)
         elif not out[k].match.label.unit and (words := unit_words(out[k], case.machine)):
-            wanted = abs(times) * abs(scale_of(then[k]) / scale_of(then[place]))  # of raw columns
             size = abs(scale_of(own))
-            fits = {word: abs(np.log(size / (wanted * find_unit(word).factor))) for word in words}
+            fits = {word: abs(np.log(size / (raw * find_unit(word).factor))) for word in words}
             out[k] = out[k].read_as(Scale(min(fits, key=lambda w: fits[w])))
         sign = int(np.sign(times)) * then[k].sign * then[place].sign * own.sign
         out[k] = replace(out[k].turned_to(sign), zero=out[k].zero)
@@ -669,7 +664,8 @@ def absolute_angles(search: Search, model: mujoco.MjModel) -> list[str]:
     of = {r.match.target: (k, case.channels[k][0]) for k, r in enumerate(case.draft.readings) if case.channels[k]}
     here = search.tried[search.best][1].miss
     for own, before in _chained(model, case.machine, {target: channel for target, (_, channel) in of.items()}):
-        if here[int(model.joint(own.split(":")[1].rpartition(".")[0]).dofadr[0])] < _WELL:
+        dof = int(model.joint(own.split(":")[1].rpartition(".")[0]).dofadr[0])
+        if here[dof] < _WELL:
             continue
         (k, channel), (_, other) = of[own], of[before]
         there = Search(
@@ -681,13 +677,13 @@ def absolute_angles(search: Search, model: mujoco.MjModel) -> list[str]:
         there.add([search.best, *_singles(search.best, search.asked)])
         there.add([tuple(turned(a) if q in g else a for q, a in enumerate(there.best)) for g in groups])
         better = search.nats(search.best) - there.nats(there.best)
-        left = here / there.tried[there.best][1].miss
-        if better > _ZERO_GAIN and left.max() > _TIMES:
+        then = float(there.tried[there.best][1].miss[dof])
+        if better > _ZERO_GAIN and here[dof] > _TIMES * then and then < _EXPLAINED:
             column = {r.match.target: r.match.column for r in case.draft.readings}
             doubts.append(
                 f"{column[own]!r} looks like the angle of a link against the world, not of a joint: with "
-                f"{column[before]!r} taken off, {left.max():.2g} times less of the joints' forces is left; log the "
-                "difference, or write it as a column of its own"
+                f"{column[before]!r} taken off, {here[dof] / then:.2g} times less of the joints' forces is left; log "
+                "the difference, or write it as a column of its own"
             )
     return doubts
 

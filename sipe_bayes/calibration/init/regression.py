@@ -208,8 +208,8 @@ class Regression:
         speed, given_by = flat[:, nq + 2 * nv :], forces[..., None, :] * np.moveaxis(moments, 1, 2)
         return Motion(asked, inertial, speed, given_by, flat, self.known, free, tuple(turned))
 
-    def fit(self, assumption: Assumption, late: Sequence[int] | None = None) -> Outcome:
-        """The regression at every delay, or at those of these numbers, and its best."""
+    def fit(self, assumption: Assumption, every: bool = True) -> Outcome:
+        """The regression at every delay, or at some and those near the best of these, and its best."""
         motion = self.given_motion if assumption == self.given else self.motion(assumption)
         free = motion.free
         size = np.sqrt(motion.inertial[free].var(0) + (motion.asked - motion.inertial)[free].var(0))
@@ -218,16 +218,18 @@ class Regression:
             none, gains = np.ones(motion.usable.shape), np.zeros(len(self.actuators))
             rest = 0.0, np.zeros(len(self.delays)), 0.0, 0.0, np.zeros_like(motion.asked), size
             return Outcome(none, gains, gains + np.inf, 0 * none, 0 * none, *rest)
-        tried = {d: self._solved(motion, d, dofs, size) for d in (range(len(self.delays)) if late is None else late)}
-        costs = np.full(len(self.delays), np.inf)
-        costs[list(tried)] = [one.unexplained + one.far_off / self.count for one in tried.values()]
-        best, gyros = (
-            int(np.argmin(costs)),
-            tuple(self._turned(*pair) for pair in zip(self.gyros, motion.rates, strict=True)),
-        )
-        delay = _finer(self.delays, costs) if late is None else float(self.delays[best])
-        unexplained = tried[best].unexplained + sum(float(np.log(left.min())) for left in gyros)
-        return replace(tried[best], delay=delay, behind=costs - costs[best], unexplained=unexplained, gyros=gyros)
+        costs, last = np.full(len(self.delays), np.inf), len(self.delays) - 1
+        for some in (range(0, last + 1, 1 if every else 3), (-1, 1)):
+            near = int(np.argmin(costs)) if np.isfinite(costs).any() else 0
+            for d in some if isinstance(some, range) else (min(max(near + x, 0), last) for x in some):
+                if np.isinf(costs[d]):
+                    one = self._solved(motion, d, dofs, size)
+                    costs[d] = one.unexplained + one.far_off / self.count
+        best = int(np.argmin(costs))
+        gyros = tuple(self._turned(*pair) for pair in zip(self.gyros, motion.rates, strict=True))
+        done, delay = self._solved(motion, best, dofs, size, True), _finer(self.delays, costs)
+        unexplained = done.unexplained + sum(float(np.log(left.min())) for left in gyros)
+        return replace(done, delay=delay, behind=costs - costs[best], unexplained=unexplained, gyros=gyros)
 
     def _turned(self, gyro: Gyro, rates: FloatArray) -> FloatArray:
         """What is left (F,) of a gyro's rates with each factor, whichever is late, and whatever its constant error."""
@@ -241,8 +243,8 @@ class Regression:
             left.append(np.divide(away, sizes))
         return np.clip(np.min(left, axis=0), _BEST, _WORST)
 
-    def _solved(self, motion: Motion, delay: int, dofs: IntArray, sizes: FloatArray) -> Outcome:
-        """At one delay: gains of any sign, friction of none but its own."""
+    def _solved(self, motion: Motion, delay: int, dofs: IntArray, sizes: FloatArray, told: bool = False) -> Outcome:
+        """At one delay, gains of any sign, friction of none but its own; told: with errors."""
         size, free = sizes[dofs], motion.free
         count, n, actuators = len(motion.asked), len(dofs), len(self.actuators)
         usual = np.sqrt((motion.speed[:, dofs] ** 2).mean(0)) + 1e-12
@@ -279,10 +281,12 @@ class Regression:
         shares = np.zeros_like(motion.asked)
         shares[:, dofs] = left
         gains = found[:actuators]
-        weighted = (columns / miss[:, None]).reshape(count * n, -1) / scale
-        alike = count / self._independent(left)
-        spread = np.linalg.inv(weighted.T @ weighted + _ROUNDING * np.eye(len(scale))) * alike
-        errors = np.sqrt(np.diag(spread)[:actuators]) / scale[:actuators]
+        errors = np.zeros(actuators)
+        if told:
+            weighted = (columns / miss[:, None]).reshape(count * n, -1) / scale
+            alike = count / self._independent(left)
+            spread = np.linalg.inv(weighted.T @ weighted + _ROUNDING * np.eye(len(scale))) * alike
+            errors = np.sqrt(np.diag(spread)[:actuators]) / scale[:actuators]
         both = float(np.log(np.minimum(miss, _WORST)).sum()), self._far_off(gains)
         return Outcome(whole, gains, errors, damping, friction, 0.0, np.zeros(0), *both, shares, sizes)
 
