@@ -551,39 +551,51 @@ def with_zeros(case: Case, model: mujoco.MjModel) -> Draft:
     for _ in range(len(joints)):
         tried = []
         for k, joint in joints.items():
-            named = _named(model, joint)
             grid = _grid(case, model, k, joint) if k in shown else np.zeros(0)
-            values = [*named.items(), *((float(v), "") for v in grid)]
-            for value, why in values:
-                tried += [
-                    (
-                        case.nats(case.outcome(put)) + (DECIDED if sign != readings[k].sign else 0.0),
-                        k,
-                        value,
-                        why,
-                        put,
-                    )
-                    for sign in (1, -1)
-                    for put in [_put_zero(readings, k, tied.get(k), value, sign, 0.0)]
-                ]
-        if not tried:
+            for value, why in [*_named(model, joint).items(), *((float(v), "") for v in grid)]:
+                for sign in (1, -1):
+                    put = _put_zero(readings, k, tied.get(k), value, sign, 0.0)
+                    tried.append((case.nats(case.outcome(put)), k, why, put))
+        named = [one for one in tried if one[2] and case.nats(now) - one[0] > DECIDED]
+        best = _best_zero(case, model, joints, tied, readings, named or [one for one in tried if not one[2]])
+        if best is None:
             break
-        named_first = [one for one in tried if one[3] and case.nats(now) - one[0] > DECIDED]
-        score, k, value, why, put = min(named_first or tried, key=lambda one: one[0])
-        if not why:
-            score, put = _refined(case, model, joints[k], put, k, tied.get(k))
-        if (
-            case.nats(now) - score < (DECIDED if why else _ZERO_GAIN)
-            or abs(scale_of(put[k]) * put[k].zero) < _LEAST_ZERO
-        ):
-            break
+        score, k, why, put = best
         then = case.outcome(put)
+        gains = case.nats(now) - score > (DECIDED if why else _ZERO_GAIN)
+        if not gains or abs(scale_of(put[k]) * put[k].zero) < _LEAST_ZERO:
+            break
         if not why and then.miss[dofs[k]] > _EXPLAINED:
             break
         times = float((now.miss / then.miss).max())
         readings, now = _say_zero(put, k, tied.get(k), why, times), then
         del joints[k]
     return _read_as(draft, readings, draft.doubts)
+
+
+Tried = tuple[float, int, str, list[Reading]]  # nats, the place of a reading, why it may have a zero, all readings
+
+
+def _best_zero(
+    case: Case,
+    model: mujoco.MjModel,
+    joints: dict[int, Joint],
+    tied: dict[int, int],
+    readings: Readings,
+    tried: Sequence[Tried],
+) -> Tried | None:
+    """The best of some zeros, of a grid looked for once more; with the other sign where that is clearly better."""
+    best: Tried | None = None
+    for turned_round in (False, True):
+        own = [one for one in tried if (one[3][one[1]].sign != readings[one[1]].sign) == turned_round]
+        if not own:
+            continue
+        score, k, why, put = min(own, key=lambda one: one[0])
+        if not why:
+            score, put = _refined(case, model, joints[k], put, k, tied.get(k))
+        if best is None or score < best[0] - DECIDED:
+            best = score, k, why, put
+    return best
 
 
 def _put_zero(

@@ -219,12 +219,13 @@ class Regression:
             rest = 0.0, np.zeros(len(self.delays)), 0.0, 0.0, np.zeros_like(motion.asked), size
             return Outcome(none, gains, gains + np.inf, 0 * none, 0 * none, *rest)
         costs, last = np.full(len(self.delays), np.inf), len(self.delays) - 1
-        for some in (range(0, last + 1, 1 if every else 3), (-1, 1)):
-            near = int(np.argmin(costs)) if np.isfinite(costs).any() else 0
-            for d in some if isinstance(some, range) else (min(max(near + x, 0), last) for x in some):
-                if np.isinf(costs[d]):
-                    one = self._solved(motion, d, dofs, size)
-                    costs[d] = one.unexplained + one.far_off / self.count
+        left = list(range(0, last + 1, 1 if every else 3))
+        while left:  # down to the best of its neighbours
+            for d in left:
+                one = self._solved(motion, d, dofs, size)
+                costs[d] = one.unexplained + one.far_off / self.count
+            near = int(np.argmin(costs))
+            left = [d for d in (near - 1, near + 1) if 0 <= d <= last and np.isinf(costs[d])]
         best = int(np.argmin(costs))
         gyros = tuple(self._turned(*pair) for pair in zip(self.gyros, motion.rates, strict=True))
         done, delay = self._solved(motion, best, dofs, size, True), _finer(self.delays, costs)
