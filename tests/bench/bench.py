@@ -28,6 +28,7 @@ import ddpg
 import envs
 import everyday
 import fits
+import init
 import laws
 import mujoco
 import mujoco.rollout
@@ -245,7 +246,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     tables = (
         *("engine", "batch", "rival", "stages", "chain", "envs", "memory", "fits", "ddpg", "laws"),
-        *("discover", "transfer", "shapes", "everyday"),
+        *("discover", "transfer", "shapes", "everyday", "init"),
     )
     parser.add_argument("tables", nargs="*", help=f"any of {', '.join(tables)}; default all")
     parser.add_argument("--pairs", type=int, default=7)
@@ -269,6 +270,8 @@ def main() -> None:
             ddpg.table(given.pairs, side_by_side)
         elif name == "everyday":
             everyday.table()
+        elif name == "init":
+            init.table()
         elif name == "laws":
             laws.table(given.pairs, side_by_side)
         elif name == "discover":

@@ -92,6 +92,4 @@ def _turned(group: Sequence[int]) -> Callable[[Draft], Draft]:
 
 
 def _put(draft: Draft, changed: dict[int, Reading]) -> Draft:
-    readings = [changed.get(k, reading) for k, reading in enumerate(draft.readings)]
-    measured = len(draft.measurements)
-    return replace(draft, measurements=tuple(readings[:measured]), commands=tuple(readings[measured:]))
+    return draft.with_readings([changed.get(k, reading) for k, reading in enumerate(draft.readings)])

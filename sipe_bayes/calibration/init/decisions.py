@@ -338,7 +338,7 @@ def decide(search: Search) -> Draft:
     _with_ties(case, tied, readings)
     readings = _untied(case, _driven(case, readings, outcome), tied)
     groups = _mirrored(search)
-    done = _read_as(draft, readings, [*draft.doubts, *_said(groups, readings)])
+    done = replace(draft.with_readings(readings), doubts=(*draft.doubts, *_said(groups, readings)))
     columns = [tuple(readings[k].match.column for k in group) for group in groups]
     return replace(done, together=tuple(columns))
 
@@ -356,7 +356,7 @@ def _by_names(case: Case, tied: dict[int, tuple[int, float]], asked: list[Questi
     doubts = [*draft.doubts, f"{text}; look at the model and at what drives it"]
     answers = [question.answers[0] for question in asked]
     readings = _with_tied(case, answered(draft.readings, asked, answers), tied)
-    return _read_as(draft, readings, [*doubts, *guessed(readings)])
+    return replace(draft.with_readings(readings), doubts=(*doubts, *guessed(readings)))
 
 
 def guessed(readings: Readings) -> list[str]:
@@ -380,13 +380,6 @@ def _untied(case: Case, readings: Readings, tied: dict[int, tuple[int, float]]) 
             text = f"the position of {joint.name} does not follow it; if it is a torque, make the actuator a <motor>"
             out[k] = replace(reading, doubts=(*reading.doubts, text))
     return out
-
-
-def _read_as(draft: Draft, readings: Readings, doubts: Sequence[str]) -> Draft:
-    measured = len(draft.measurements)
-    return replace(
-        draft, measurements=tuple(readings[:measured]), commands=tuple(readings[measured:]), doubts=tuple(doubts)
-    )
 
 
 def _with_evidence(search: Search, q: int, readings: list[Reading]) -> None:
@@ -570,7 +563,7 @@ def with_zeros(case: Case, model: mujoco.MjModel) -> Draft:
         times = float((now.miss / then.miss).max())
         readings, now = _say_zero(put, k, tied.get(k), why, times), then
         del joints[k]
-    return _read_as(draft, readings, draft.doubts)
+    return draft.with_readings(readings)
 
 
 Tried = tuple[float, int, str, list[Reading]]  # nats, the place of a reading, why it may have a zero, all readings

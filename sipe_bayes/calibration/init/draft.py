@@ -237,6 +237,11 @@ class Draft:
         """Measurements, then commands."""
         return (*self.measurements, *self.commands)
 
+    def with_readings(self, readings: Sequence[Reading]) -> Draft:
+        """The draft with others in their places."""
+        measured = len(self.measurements)
+        return replace(self, measurements=tuple(readings[:measured]), commands=tuple(readings[measured:]))
+
     @property
     def proposed(self) -> tuple[Unknown, ...]:
         """The unknowns that are asked for."""

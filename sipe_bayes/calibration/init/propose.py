@@ -323,7 +323,7 @@ def _decided(
         against_world = absolute_angles(searched(case(placed)), model)
     there = case(placed)
     read, turned = with_units_of_names(there, placed.readings), with_gyros(there, gyros)
-    done, unlike = with_forces(_read_with(placed, read), forces, model, machine, sources, folder)
+    done, unlike = with_forces(placed.with_readings(read), forces, model, machine, sources, folder)
     tell("delay and unknowns")
     last = case(done)
     last.regression.springs = springs_act
@@ -337,11 +337,6 @@ def _decided(
         notes=(*draft.notes, *unlike, *notes), delay=delay,
         doubts=(*odd, *against_world, *done.doubts, *lost, *doubts),
     )  # fmt: skip
-
-
-def _read_with(draft: Draft, readings: Sequence[Reading]) -> Draft:
-    measured = len(draft.measurements)
-    return replace(draft, measurements=tuple(readings[:measured]), commands=tuple(readings[measured:]))
 
 
 def _undecided(draft: Draft, model: mujoco.MjModel, machine: Machine) -> Draft:
