@@ -39,6 +39,7 @@ GYRO_WORDS = ("rad/s", "deg/s")
 _ALIKE = np.log(1.12)  # sizes of units that no model is right enough to tell apart
 _TURNS = 0.4  # of a gyro's rates, up to which it turns with what is measured
 _FOLLOWS = 0.5  # share of a set-point's variance, from which a position follows it
+_PARTS, _ALIKE_PARTS = 10, 0.6  # of a log, and how many of these are to go alike
 _AGAINST = 0.3  # of a set-point's variance, by which it has to be told that a position goes the other way
 _LATEST = 0.3  # s, of a position behind its set-point
 _USELESS = 0.9  # of the forces, what is left where the model explains nothing
@@ -149,7 +150,7 @@ def _ratio(regression: Regression, command: int, channel: int) -> tuple[float, f
     for late in range(most + 1):
         logs = regression.logs
         pairs = [(log.actions[: len(log) - late, command], log.observations[late:-1, channel]) for log in logs]
-        one, other = (np.concatenate([x - x.mean() for x in own]) for own in zip(*pairs, strict=True))
+        one, other = _alike_most(pairs)
         size = float((one @ one) * (other @ other))
         if size <= 0:
             continue
@@ -160,6 +161,19 @@ def _ratio(regression: Regression, command: int, channel: int) -> tuple[float, f
             against = max(against, (share, -times))
     share, times = against if against[0] > along[0] + _AGAINST else along
     return times, share
+
+
+def _alike_most(pairs: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
+    """The parts of two series, each less its mean, that go most alike: a drive may be off for a while."""
+    parts = [
+        (a - a.mean(), b - b.mean())
+        for own in pairs
+        for a, b in zip(*(np.array_split(x, 10) for x in own), strict=True)
+    ]
+    alike = [abs(float(a @ b)) / np.sqrt(max(float((a @ a) * (b @ b)), 1e-30)) for a, b in parts]
+    most = np.argsort(alike)[-max(1, int(_ALIKE_PARTS * len(parts))) :]
+    one, other = zip(*(parts[k] for k in most), strict=True)
+    return np.concatenate(one), np.concatenate(other)
 
 
 @dataclass

@@ -200,7 +200,8 @@ def _kind(flags: set[str], unit: str, words: list[str]) -> Kind:
     says = {*words} & (POSITIONS | COMMANDS)
     if unit in OF_NO_JOINT.values() and says <= {"p", "a"} and not flags & {"torque", "desired"}:
         return Kind.OTHER
-    place = bool(flags & {"angle", "length", "place"}) and not ("current" in flags and unit in ("A", "mA"))
+    current = "current" in flags and (unit in ("A", "mA") or words[-2:] == ["present", "current"])
+    place = bool(flags & {"angle", "length", "place"}) and not current
     drive = _driven(flags, place)
     if words and words[-1] in ("time", "stamp", "timestamp"):
         return Kind.TIME
