@@ -34,6 +34,7 @@ from sipe_bayes.posterior import prior
 
 _LOGS = 3  # that are looked at
 _BETTER = 2 * DECIDED  # nats, from which another reading is named
+_LOST, _PAIRS = 0.3, 60  # of a joint's forces, from which columns may be swapped; pairs that are tried
 _ROOM = 0.05  # of a ctrlrange, by which a command may lie beyond it
 
 
@@ -127,8 +128,11 @@ def _swapped(case: Case) -> list[str]:
     """Two columns of commands, or of positions, with which more is explained the other way round."""
     regression, out = case.regression, []
     now, environment = case.nats(regression.fit(regression.given)), regression.environment
+    lost = regression.fit(regression.given).miss[regression.known]
+    if not len(lost) or lost.max() < _LOST:
+        return []
     columns = [(k, case.commands[k], case.channels[k][:1]) for k in range(len(case.draft.readings))]
-    for (a, i, at), (b, j, to) in itertools.combinations(columns, 2):
+    for (a, i, at), (b, j, to) in itertools.islice(itertools.combinations(columns, 2), _PAIRS):
         one, other = case.draft.readings[a], case.draft.readings[b]
         if (
             one.commanded != other.commanded
@@ -145,6 +149,7 @@ def _swapped(case: Case) -> list[str]:
                 seen[:, [*at, *to]] = seen[:, [*to, *at]]
             logs.append(Trajectory(seen, actions, log.dt))
         there = Regression(environment, logs, regression.delays)
+        there.one_way, there.scales, there.springs = regression.one_way, regression.scales, regression.springs
         gain = now - case.nats(there.fit(there.given))
         if gain > _BETTER:
             names = f"columns {one.match.column!r} and {other.match.column!r}"

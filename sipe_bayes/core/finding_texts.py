@@ -279,8 +279,8 @@ class Code(Enum):
         "model follows it all the same"
     )
     COLUMN_NOT_FOLLOWED = note(
-        "before the fit, nothing that is simulated follows {channel!r}: short windows miss {times:.2g} times what "
-        "going on straight does; look at its zero, unit and sign, which sipe init tries, and at what the model lacks"
+        "before the fit, the model explains little of the forces that move {channel!r}: {times:.2g} times their change "
+        "is left; look at its zero, unit and sign, which sipe init tries, and at what the model lacks"
     )
     LOGS_DISAGREE = blocking(
         "the logs disagree about {parameters} (p = {p:.1g}): the others being common, {estimates}; "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import mujoco
+
 from sipe_bayes.calibration.init.machine import Drive
 from sipe_bayes.calibration.init.regression import Regression
 from sipe_bayes.calibration.problem import Problem
@@ -22,6 +24,7 @@ def not_followed(problem: Problem) -> tuple[Finding, ...]:
     regression.one_way[:] = True  # signs are those of the configuration
     outcome = regression.fit(regression.given)
     held = [i for i, drive in zip(regression.actuators, regression.drives, strict=True) if drive == Drive.POSITION]
+    held = [i for i in held if int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_JOINT)]
     served = {int(model.jnt_dofadr[model.actuator_trnid[i, 0]]) for i in held}  # by gains that few models have right
     fitted, out = problem.likelihood.fit or problem.environment.channels, []
     for channel in problem.environment.measurements:

@@ -66,11 +66,16 @@ def _settled(k: int, lines: Sequence[str]) -> Callable[[Draft], Draft]:
     """Reading number ``k`` with these lines in its table, and nothing open."""
 
     def change(draft: Draft) -> Draft:
-        keys = tomllib.loads("\n".join(lines))
+        keys, own = tomllib.loads("\n".join(lines)), draft.readings[k]
         if "unit" in keys:
-            keys = {"factor": 1.0, "zero": 0.0} | keys
-        changed = replace(draft.readings[k], doubts=(), instead=(), **_fields(draft.readings[k], keys))
-        return _put(draft, {k: changed})
+            keys = {"factor": 1.0} | ({"zero": 0.0} if own.ends or own.scale.zero else {}) | keys
+        sign = keys.pop("sign", own.sign)
+        changed = {k: replace(own, doubts=(), instead=(), **_fields(own, dict(keys))).turned_to(sign)}
+        for place, other in enumerate(draft.readings):  # a set-point is read as the position that follows it
+            if (own.match.column, other.match.column) in draft.tied and "unit" in keys:
+                alike = (own.unit, own.factor) == (other.unit, other.factor)
+                changed |= {place: replace(other, **_fields(other, dict(keys)))} if alike else {}
+        return _put(draft, changed)
 
     return change
 
@@ -86,7 +91,9 @@ def _fields(reading: Reading, keys: dict[str, Any]) -> dict[str, Any]:
 
 def _turned(group: Sequence[int]) -> Callable[[Draft], Draft]:
     def change(draft: Draft) -> Draft:
-        return _put(draft, {k: draft.readings[k].turned_to(turned(draft.readings[k].sign)) for k in group})
+        joints = {draft.readings[k].match.target.rpartition(".")[0] for k in group} - {""}
+        felt = [k for k, r in enumerate(draft.readings) if r.match.target.rpartition(".")[0] in joints]
+        return _put(draft, {k: draft.readings[k].turned_to(turned(draft.readings[k].sign)) for k in {*group, *felt}})
 
     return change
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
-import numpy as np
 from pydantic import ValidationError
 
 from sipe_bayes.calibration.config_fields import ConfigError, one_line
@@ -19,6 +18,7 @@ from sipe_bayes.calibration.init.regression import Gyro, Regression
 from sipe_bayes.calibration.init.unknowns.candidates import as_parameters, candidates
 from sipe_bayes.calibration.logs import load_logs
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.smoothing import filled
 from sipe_bayes.core.telling import Tell, silent
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.core.units import find_unit
@@ -44,7 +44,7 @@ def tried_part(draft: Draft) -> Draft:
     places = {r.match.target for r in draft.measurements}
 
     def is_tried(target: str) -> bool:
-        if target.startswith("sensor:") or target.endswith(("linear_velocity", "angular_velocity")):
+        if target.startswith("sensor:") or target.endswith(("linear_velocity", "angular_velocity", ".force")):
             return False
         return not target.endswith(".velocity") or target.removesuffix("velocity") + "position" not in places
 
@@ -138,7 +138,7 @@ def _gyro(model: mujoco.MjModel, regression: Regression, reading: Reading, rates
     site = int(model.sensor(reading.match.target.removeprefix("sensor:")).objid[0])
     named, own = reading.match.label.unit, find_unit(reading.unit).factor
     factors = tuple(find_unit(word).factor / own for word in GYRO_WORDS)
-    some = [np.nan_to_num(x[: len(log) + 1]) for x, log in zip(rates, regression.logs, strict=True)]
+    some = [filled(x[: len(log) + 1]) for x, log in zip(rates, regression.logs, strict=True)]
     return Gyro(site, tuple(some), (1.0,) if named not in ("", *GYRO_WORDS) else factors)
 
 

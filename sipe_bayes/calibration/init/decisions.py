@@ -39,10 +39,12 @@ GYRO_WORDS = ("rad/s", "deg/s")
 _ALIKE = np.log(1.12)  # sizes of units that no model is right enough to tell apart
 _TURNS = 0.4  # of a gyro's rates, up to which it turns with what is measured
 _FOLLOWS = 0.5  # share of a set-point's variance, from which a position follows it
+_SHORTEST = 20  # samples of a log, beside a delay
 _PARTS, _ALIKE_PARTS = 10, 0.6  # of a log, and how many of these are to go alike
 _AGAINST = 0.3  # of a set-point's variance, by which it has to be told that a position goes the other way
 _LATEST = 0.3  # s, of a position behind its set-point
 _USELESS = 0.9  # of the forces, what is left where the model explains nothing
+_LITTLE, _HARDLY = 0.02, 0.7  # of a joint's range, and what a motion that small counts as
 _OUTSIDE, _BEYOND = 6.0, 0.1  # nats against samples beyond a joint's range, by a share of which it may be off
 _NEAR, _FAR = np.log(3.0), np.log(5.0)  # of the logarithm of a ratio: the same; another unit, or a model far off
 _ZEROS, _FINER = 11, 9  # zeros that are tried over the range of a joint, and around the best
@@ -95,6 +97,7 @@ class Case:
         """What the regression says of other units, signs and zeros than the draft's."""
         given = self.regression.given
         observed, driven, zeros = list(given.observed), list(given.driven), [0.0] * len(given.observed)
+        rests = [0.0] * len(driven)
         for k, (now, then) in enumerate(zip(readings, self.draft.readings, strict=True)):
             factor = scale_of(now) / scale_of(then)
             for channel in self.channels[k]:
@@ -102,7 +105,9 @@ class Case:
                 zeros[channel] = scale_of(now) * (now.zero - then.zero)
             if (command := self.commands[k]) is not None:
                 driven[command] *= factor
-        assumption = Assumption(tuple(observed), tuple(driven), tuple(zeros) if any(zeros) else (), self.minus)
+                rests[command] = scale_of(now) * (now.zero - then.zero)
+        shifts = (tuple(own) if any(own) else () for own in (zeros, rests))
+        assumption = Assumption(tuple(observed), tuple(driven), next(shifts), self.minus, next(shifts))
         if assumption not in self._known:
             self._known[assumption] = self.regression.fit(assumption, every=False)
         return self._known[assumption]
@@ -148,7 +153,9 @@ def _ratio(regression: Regression, command: int, channel: int) -> tuple[float, f
     along, against = (0.0, 0.0), (0.0, 0.0)
     most = int(min(_LATEST / regression.logs[0].dt, regression.period / 4))
     for late in range(most + 1):
-        logs = regression.logs
+        logs = [log for log in regression.logs if len(log) > late + _SHORTEST]
+        if not logs:
+            continue
         pairs = [(log.actions[: len(log) - late, command], log.observations[late:-1, channel]) for log in logs]
         one, other = _alike_most(pairs)
         size = float((one @ one) * (other @ other))
@@ -309,13 +316,14 @@ def _odd_sizes(case: Case, readings: Readings) -> float:
 
 
 def _outside(case: Case, reading: Reading, factor: float, channel: int) -> float:
-    """The share of samples that lie beyond the range of a reading's joint."""
+    """The share of samples beyond the range of a reading's joint, and something where it hardly moves in it."""
     reach = next((j.reach for j in case.machine.joints if reading.match.target == f"joint:{j.name}.position"), None)
     if reach is None:
         return 0.0
     values = np.concatenate([log.observations[:, channel] for log in case.regression.logs]) * factor
     room = _BEYOND * (reach[1] - reach[0])
-    return float(np.mean((values < reach[0] - room) | (values > reach[1] + room)))
+    hardly = _HARDLY * (np.nanmax(values) - np.nanmin(values) < _LITTLE * (reach[1] - reach[0]))
+    return float(np.mean((values < reach[0] - room) | (values > reach[1] + room))) + float(hardly)
 
 
 def searched(case: Case) -> Search:
@@ -354,7 +362,8 @@ def decide(search: Search) -> Draft:
     groups = _mirrored(search)
     done = replace(draft.with_readings(readings), doubts=(*draft.doubts, *_said(groups, readings)))
     columns = [tuple(readings[k].match.column for k in group) for group in groups]
-    return replace(done, together=tuple(columns))
+    pairs = tuple((readings[place].match.column, readings[k].match.column) for k, (place, _) in tied.items())
+    return replace(done, together=tuple(columns), tied=pairs)
 
 
 def _without(question: Question, case: Case, tied: dict[int, tuple[int, float]]) -> Question:
@@ -560,48 +569,48 @@ def with_zeros(case: Case, model: mujoco.MjModel) -> Draft:
         for k, joint in joints.items():
             grid = _grid(case, model, k, joint) if k in shown else np.zeros(0)
             for value, why in [*_named(model, joint).items(), *((float(v), "") for v in grid)]:
-                for sign in (1, -1):
-                    put = _put_zero(readings, k, tied.get(k), value, sign, 0.0)
-                    tried.append((case.nats(case.outcome(put)), k, why, put))
+                for sign, follower in itertools.product((1, -1), {tied.get(k), None}):
+                    put = _put_zero(readings, k, follower, value, sign, 0.0)
+                    tried.append((case.nats(case.outcome(put)), k, why, follower, put))
         named = [one for one in tried if one[2] and case.nats(now) - one[0] > DECIDED]
-        best = _best_zero(case, model, joints, tied, readings, named or [one for one in tried if not one[2]])
+        best = _best_zero(case, model, joints, readings, named or [one for one in tried if not one[2]])
         if best is None:
             break
-        score, k, why, put = best
+        score, k, why, follower, put = best
         then = case.outcome(put)
         gains = case.nats(now) - score > (DECIDED if why else _ZERO_GAIN)
         if not gains or abs(scale_of(put[k]) * put[k].zero) < _LEAST_ZERO:
             break
-        if not why and then.miss[dofs[k]] > _EXPLAINED:
+        if not why and then.miss[dofs[k]] > min(_EXPLAINED, now.miss[dofs[k]] / _TIMES):
             break
         times = float((now.miss / then.miss).max())
-        readings, now = _say_zero(put, k, tied.get(k), why, times), then
+        readings, now = _say_zero(put, k, follower, why, times), then
         del joints[k]
     return draft.with_readings(readings)
 
 
-Tried = tuple[float, int, str, list[Reading]]  # nats, the place of a reading, why it may have a zero, all readings
+Tried = tuple[float, int, str, int | None, list[Reading]]
+"""Nats, the place of a reading, why it may have a zero, the set-point that has it too, and all readings."""
 
 
 def _best_zero(
     case: Case,
     model: mujoco.MjModel,
     joints: dict[int, Joint],
-    tied: dict[int, int],
     readings: Readings,
     tried: Sequence[Tried],
 ) -> Tried | None:
     """The best of some zeros, of a grid looked for once more; with the other sign where that is clearly better."""
     best: Tried | None = None
     for turned_round in (False, True):
-        own = [one for one in tried if (one[3][one[1]].sign != readings[one[1]].sign) == turned_round]
+        own = [one for one in tried if (one[4][one[1]].sign != readings[one[1]].sign) == turned_round]
         if not own:
             continue
-        score, k, why, put = min(own, key=lambda one: one[0])
+        score, k, why, follower, put = min(own, key=lambda one: one[0])
         if not why:
-            score, put = _refined(case, model, joints[k], put, k, tied.get(k))
+            score, put = _refined(case, model, joints[k], put, k, follower)
         if best is None or score < best[0] - DECIDED:
-            best = score, k, why, put
+            best = score, k, why, follower, put
     return best
 
 

@@ -211,6 +211,7 @@ class Draft:
         unused: columns that are none of the model's.
         delay: of the commands, in samples.
         seconds: that a calibration may take; 0 where nothing says it.
+        tied: columns of positions, each with that of the set-point that it follows.
         together: columns that may be turned round together, in groups.
         names: of columns without a header.
     """
@@ -230,6 +231,7 @@ class Draft:
     delay: float = 0.0
     seconds: float = 0.0
     together: tuple[tuple[str, ...], ...] = ()
+    tied: tuple[tuple[str, str], ...] = ()
     names: tuple[str, ...] = ()
 
     @property
@@ -353,7 +355,7 @@ def _scales(reading: Reading, machine: Machine) -> tuple[Scale, ...]:
 def is_tried(draft: Draft, reading: Reading) -> bool:
     """Whether simulations say something of it: commands, positions, and velocities of joints without these."""
     target = reading.match.target
-    if reading.match.quaternion or target.startswith("sensor:"):
+    if reading.match.quaternion or target.startswith("sensor:") or target.endswith(".force"):
         return False
     if target.endswith(".velocity"):
         place = target.removesuffix("velocity") + "position"

@@ -21,6 +21,7 @@ from sipe_bayes.calibration.init.draft import Draft, Reading
 from sipe_bayes.calibration.init.machine import Machine
 from sipe_bayes.calibration.init.regression import turning_of
 from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.smoothing import filled
 from sipe_bayes.core.units import find_unit, unit_words
 
 _FOLLOWS = 0.3  # share of variance from which a column is the force of a drive, whose gains may be off
@@ -56,11 +57,13 @@ def with_forces(
     outcome, motion = regression.fit(regression.given), regression.given_motion
     damping = regression.simulator.model.dof_damping
     seen = motion.asked + damping * motion.speed + outcome.friction * turning_of(motion.speed)
+    nq, nv = model.nq, model.nv
+    seen = seen + outcome.armature * motion.states[:, nq + nv : nq + 2 * nv]
     place = sum(len(m.channels) for m in draft.config(folder).measurements)
     logs = [log.slice(0, len(own)) for log, own in zip(loaded(whole, sources, folder), regression.logs, strict=True)]
     measured = np.concatenate(
         [
-            gaussian_filter1d(log.observations[:, place:], width, axis=0)[rows]
+            gaussian_filter1d(filled(log.observations[:, place:]), width, axis=0)[rows]
             for log, width, rows in zip(logs, regression.widths, regression.rows, strict=True)
         ]
     )

@@ -69,10 +69,11 @@ def _limits(case: Case, model: mujoco.MjModel) -> Iterator[Oddity]:
         name, hinge = model.joint(joint).name, int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_HINGE)
         text = f"{reading.match.column!r}: {100 * share:.0f} % of the samples are at or beyond the range of {name}"
         turn = 180 / np.pi
-        if hinge and low * turn <= values.min() and values.max() <= high * turn and share > 10 * _AT_LIMIT:
+        beyond = max(low - values.min(), values.max() - high) > high - low
+        if hinge and beyond and low * turn <= values.min() and values.max() <= high * turn:
             yield Oddity(
-                "angle", f"{text}, {low:.3g} to {high:.3g} rad: the model's angles look like radians that are read as "
-                'degrees; write <compiler angle="radian"/>',
+                "angle", f"{text}, {low:.3g} to {high:.3g} rad: look at the column's unit; or the model's angles are "
+                'radians that are read as degrees, which <compiler angle="radian"/> mends',
             )  # fmt: skip
         else:
             yield Oddity("limit", f"{text}, {low:.3g} to {high:.3g}: widen the range, or look at unit and zero")
@@ -152,7 +153,7 @@ def _unsigned(case: Case, opened: Opened) -> Iterator[Oddity]:
     if both and sizes:
         yield Oddity(
             "unsigned", f"{', '.join(sizes)}: without a change of sign while joints move both ways: sizes, and no "
-            "measurements of a force",
+            "measurements of a force, unless a load keeps its side",
         )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from functools import cached_property
 import mujoco
 import numpy as np
 import scipy.optimize
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from sipe_bayes.calibration.init.machine import Drive, drive_of
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
@@ -38,6 +38,7 @@ _OFF_SERVO = np.log(10.0)  # likewise of a servo, whose gains few models have ri
 _BEST = 1e-3  # of the forces, the least that is left
 _ROUNDING = 1e-10  # of a column's size
 _LATE_GYRO = 0.06  # s, that a gyro may be late
+_STOP = 0.01  # of a joint's range, within which it is at its end
 _GAP = 0.7  # of the gap between measured samples, the least kernel
 _FREE = 0.2  # of the rows, so few of which are no better than all
 _WORST = 10.0  # and the most
@@ -54,12 +55,14 @@ class Assumption:
         driven: (A,) what each command is multiplied by.
         zeros: (O,) SI, what is taken off each channel once it is multiplied; none where empty.
         minus: pairs of channels, the second of which is taken off the first.
+        rests: (A,) SI, what is taken off each command once it is multiplied; none where empty.
     """
 
     observed: tuple[float, ...]
     driven: tuple[float, ...]
     zeros: tuple[float, ...] = ()
     minus: tuple[tuple[int, int], ...] = ()
+    rests: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,7 @@ class Outcome:
         errors: (A,) standard errors of these.
         damping: (V,) force per velocity.
         friction: (V,) level of dry friction.
+        armature: (V,) inertia of rotors and gears beside the model's.
         delay: samples, between those that were tried.
         behind: (D,) of each delay that was tried, by how much more is left than at the best: sum of logarithms.
         unexplained: the sum of the logarithms of what is left: the smaller the better.
@@ -120,6 +124,7 @@ class Outcome:
     errors: FloatArray
     damping: FloatArray
     friction: FloatArray
+    armature: FloatArray
     delay: float
     behind: FloatArray
     unexplained: float
@@ -174,12 +179,13 @@ class Regression:
     def motion(self, assumption: Assumption) -> Motion:
         """What the model asks for and its actuators give under an assumption."""
         model, data = self.plain, self._data
-        states, given = [], []
+        states, given, loose = [], [], []
         for log, own, width, rows in zip(self.logs, self.states, self.widths, self.rows, strict=True):
             read = self._read(log, own, assumption)
             states.append(_derived(model, read, log.dt, width, self.simulator.physics_steps(log.dt)[0])[rows])
             commands = self.driven(log, assumption, width, self.simulator.model)
-            given.append(np.stack([commands[np.maximum(rows - late, 0)] for late in self.delays]))
+            given.append(np.stack([commands[np.maximum(rows - self.late(d, log), 0)] for d in self.delays]))
+            loose.append(~maximum_filter1d(_stopped(model, read), int(6 * width) + 1)[rows])
         flat, commands = np.concatenate(states), np.concatenate(given, axis=1)  # (R, S), (D, R, A)
         count, nq, nv = len(flat), model.nq, model.nv
         asked, inertial = np.zeros((2, count, nv))
@@ -201,7 +207,8 @@ class Regression:
                 mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, gyro.site, spin, 1)
                 turned[g, k] = spin[:3]
         forces = self._forces(commands, lengths, rates)
-        free = np.concatenate([seen[rows] for seen, rows in zip(self._seen, self.rows, strict=True)])
+        seen = [own[rows] for own, rows in zip(self._seen, self.rows, strict=True)]
+        free = np.concatenate(seen) & np.concatenate(loose)
         if may_touch(self.simulator.model):
             free &= ~_touches(self.simulator.model, flat[:, :nq])
         free |= free.mean() < _FREE
@@ -217,7 +224,7 @@ class Regression:
         if not len(dofs):
             none, gains = np.ones(motion.usable.shape), np.zeros(len(self.actuators))
             rest = 0.0, np.zeros(len(self.delays)), 0.0, 0.0, np.zeros_like(motion.asked), size
-            return Outcome(none, gains, gains + np.inf, 0 * none, 0 * none, *rest)
+            return Outcome(none, gains, gains + np.inf, 0 * none, 0 * none, 0 * none, *rest)
         costs, last = np.full(len(self.delays), np.inf), len(self.delays) - 1
         left = list(range(0, last + 1, 1 if every else 3))
         while left:  # down to the best of its neighbours
@@ -249,25 +256,30 @@ class Regression:
         size, free = sizes[dofs], motion.free
         count, n, actuators = len(motion.asked), len(dofs), len(self.actuators)
         usual = np.sqrt((motion.speed[:, dofs] ** 2).mean(0)) + 1e-12
-        columns = np.zeros((count, n, actuators + (5 if self.springs else 3) * n))
+        faster = motion.states[:, self.plain.nq + self.plain.nv :][:, dofs]
+        pace = np.sqrt((faster**2).mean(0)) + 1e-12
+        columns = np.zeros((count, n, actuators + (6 if self.springs else 4) * n))
         columns[..., :actuators] = motion.given[delay][:, dofs] / size[:, None]
         turning = turning_of(motion.speed[:, dofs])
         for k in range(n):
             columns[:, k, actuators + k] = -motion.speed[:, dofs[k]] / usual[k]
             columns[:, k, actuators + n + k] = -turning[:, k]
             columns[:, k, actuators + 2 * n + k] = 1.0
+            columns[:, k, actuators + 3 * n + k] = -faster[:, k] / pace[k]
             if self.springs and (place := self._places[dofs[k]]) >= 0:
                 own = motion.states[:, place] - motion.states[:, place].mean()
-                columns[:, k, actuators + 3 * n + k] = -own / (own.std() + 1e-12)
-                columns[:, k, actuators + 4 * n + k] = 1.0  # it rests anywhere
+                columns[:, k, actuators + 4 * n + k] = -own / (own.std() + 1e-12)
+                columns[:, k, actuators + 5 * n + k] = 1.0  # it rests anywhere
         wanted = (motion.asked[:, dofs] / size * free[:, None]).ravel()
         columns *= free[:, None, None]
         design = columns.reshape(count * n, -1)
         loose = np.array([drive not in (Drive.POSITION, Drive.VELOCITY) for drive in self.drives], bool)
         held = motion.asked - motion.inertial
         rest = _ZERO * np.sqrt((held[:, dofs] ** 2).mean(0)) / size  # what a zero that is a little off changes
-        low = np.concatenate([np.where(loose & ~self.one_way, -np.inf, 0.0), np.zeros(2 * n), -rest - 1e-9])
-        high = np.concatenate([np.full(actuators + 2 * n, np.inf), rest + 1e-9])
+        low = np.concatenate(
+            [np.where(loose & ~self.one_way, -np.inf, 0.0), np.zeros(2 * n), -rest - 1e-9, np.zeros(n)]
+        )
+        high = np.concatenate([np.full(actuators + 2 * n, np.inf), rest + 1e-9, np.full(n, np.inf)])
         if self.springs:
             low, high = np.append(low, [0.0] * n + [-np.inf] * n), np.append(high, [np.inf] * 2 * n)
         scale = np.sqrt((design**2).sum(0)) + 1e-12
@@ -275,10 +287,11 @@ class Regression:
         found = scipy.optimize.lsq_linear(short, rotated, (low * scale, high * scale), method="bvls").x / scale
         left = (wanted - design @ found).reshape(count, n)
         miss = np.clip(np.sqrt((left**2).sum(0) / free.sum()), _BEST, None)
-        whole, damping, friction, shares = np.ones(motion.usable.shape), *np.zeros((2, *motion.usable.shape)), None
+        whole, (damping, friction, armature) = np.ones(motion.usable.shape), np.zeros((3, *motion.usable.shape))
         whole[dofs] = miss
         damping[dofs] = found[actuators : actuators + n] * size / usual
         friction[dofs] = found[actuators + n : actuators + 2 * n] * size
+        armature[dofs] = found[actuators + 3 * n : actuators + 4 * n] * size / pace
         shares = np.zeros_like(motion.asked)
         shares[:, dofs] = left
         gains = found[:actuators]
@@ -289,7 +302,7 @@ class Regression:
             spread = np.linalg.inv(weighted.T @ weighted + _ROUNDING * np.eye(len(scale))) * alike
             errors = np.sqrt(np.diag(spread)[:actuators]) / scale[:actuators]
         both = float(np.log(np.minimum(miss, _WORST)).sum()), self._far_off(gains)
-        return Outcome(whole, gains, errors, damping, friction, 0.0, np.zeros(0), *both, shares, sizes)
+        return Outcome(whole, gains, errors, damping, friction, armature, 0.0, np.zeros(0), *both, shares, sizes)
 
     def independent(self, outcome: Outcome) -> float:
         """How many independent numbers of each degree of freedom the rows hold, by the correlation of what is left."""
@@ -318,11 +331,16 @@ class Regression:
         model, out = self.simulator.model, np.zeros_like(commands)
         for k, (index, drive) in enumerate(zip(self.actuators, self.drives, strict=True)):
             gain = _gain_of(model, index)
+            fixed = int(model.actuator_gaintype[index]) == int(mujoco.mjtGain.mjGAIN_FIXED)
+            rest, by_length, by_rate = model.actuator_biasprm[index, :3] if fixed else (0.0, -gain, -gain)
             out[..., k] = gain * commands[..., k]
-            if drive == Drive.POSITION:
-                out[..., k] -= gain * lengths[:, k]
+            if int(model.actuator_dyntype[index]) == int(mujoco.mjtDyn.mjDYN_INTEGRATOR):  # begun anywhere
+                own = gain * (commands[..., k] - commands[..., k].mean())
+                out[..., k] = own + by_length * (lengths[:, k] - lengths[:, k].mean())
+            elif drive == Drive.POSITION:
+                out[..., k] += rest + by_length * lengths[:, k]
             elif drive == Drive.VELOCITY:
-                out[..., k] -= gain * rates[:, k]
+                out[..., k] += by_rate * rates[:, k]
         return out
 
     def _read(self, log: Trajectory, states: FloatArray, assumption: Assumption) -> FloatArray:
@@ -348,6 +366,7 @@ class Regression:
     def driven(self, log: Trajectory, assumption: Assumption, width: float, model: mujoco.MjModel) -> FloatArray:
         """Commands (n + 1, A) that act at each sample, smoothed as the positions are."""
         actions = np.concatenate([log.actions, log.actions[-1:]]) * np.array(assumption.driven)
+        actions -= np.array(assumption.rests or 0.0)
         for k, index in enumerate(self.actuators):
             actions[:, k] = _filtered(model, index, actions[:, k], log.dt)
         steps = self.simulator.physics_steps(log.dt)[0]  # Euler's, in which a command acts on the position at once
@@ -373,10 +392,14 @@ class Regression:
         """Rows of each log, away from its ends."""
         each, out = max(20, _ROWS // len(self.logs)), []
         for log, width in zip(self.logs, self.widths, strict=True):
-            edge = min(int(3 * width) + max(self.delays) + 1, len(log) // 4)
+            edge = min(int(3 * width) + self.late(max(self.delays), log) + 1, len(log) // 4)
             rows = np.arange(edge, len(log) + 1 - edge)
             out.append(rows[np.unique(np.linspace(0, len(rows) - 1, min(each, len(rows))).astype(int))])
         return out
+
+    def late(self, delay: int, log: Trajectory) -> int:
+        """Samples of a log that a delay in samples of the first one is."""
+        return round(delay * self.logs[0].dt / log.dt)
 
     def _measured(self) -> BoolArray:
         """Degrees of freedom (V,) that the logs measure, and that move."""
@@ -387,6 +410,7 @@ class Regression:
             size = {0: 6, 1: 3}.get(int(model.jnt_type[joint]), 1)
             moves = any(np.ptp(own[:, 1 + first]) > 0 for own in self.states)
             known[dof : dof + size] = moves and (first in columns or size > 1)
+        known[_tied_dofs(model)] = False
         return known
 
 
@@ -471,6 +495,30 @@ def _touches(model: mujoco.MjModel, positions: FloatArray) -> BoolArray:
         mujoco.mj_collision(model, data)
         out[k] = data.ncon > 0
     return out
+
+
+def _tied_dofs(model: mujoco.MjModel) -> list[int]:
+    """Degrees of freedom that equality constraints tie: inverse dynamics knows no forces of these."""
+    out = set[int]()
+    for k in np.flatnonzero(model.eq_active0):
+        kind, pair = int(model.eq_type[k]), (int(model.eq_obj1id[k]), int(model.eq_obj2id[k]))
+        if kind == int(mujoco.mjtEq.mjEQ_JOINT):
+            out |= {int(model.jnt_dofadr[joint]) for joint in pair if joint >= 0}
+            continue
+        sites = int(model.eq_objtype[k]) == int(mujoco.mjtObj.mjOBJ_SITE)
+        for body in (int(model.site_bodyid[one]) if sites else one for one in pair):
+            while body > 0:
+                out |= set(range(model.body_dofadr[body], model.body_dofadr[body] + model.body_dofnum[body]))
+                body = int(model.body_parentid[body])
+    return sorted(out)
+
+
+def _stopped(model: mujoco.MjModel, positions: FloatArray) -> BoolArray:
+    """Whether a hinge or slide is at an end of its range in positions (n, nq)."""
+    joints = np.flatnonzero(model.jnt_limited & (model.jnt_type > 1))
+    low, high = model.jnt_range[joints].T
+    room, own = _STOP * (high - low), positions[:, model.jnt_qposadr[joints]]
+    return np.asarray(((own < low + room) | (own > high - room)).any(axis=1))
 
 
 def _gaps(log: Trajectory) -> tuple[BoolArray, float]:

@@ -59,6 +59,7 @@ def _leaves(name: str, value: object, depth: int) -> Iterator[tuple[str, NDArray
             yield from _leaves(f"{name}.{field}", inner, depth + 1)
     elif isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object and value.ndim == 1):
         rows = all(isinstance(row, dict) and not any(map(_is_many, row.values())) for row in value)
+        rows = rows and len({tuple(row) for row in value}) == 1
         for field in value[0] if rows and len(value) else ():
             yield from _leaves(f"{name}.{field}", np.array([row[field] for row in value]), depth)
         for i, inner in enumerate(() if rows else value):

@@ -135,4 +135,4 @@ def test_a_column_that_nothing_follows_is_named_before_a_fit(tmp_path: Path) -> 
     assert not_followed(prepare(path, 1)) == ()
     path.write_text(path.read_text().replace('unit = "N m"\n', 'unit = "N m"\nsign = -1\n'))
     (noticed,) = not_followed(prepare(path, 1))
-    assert "nothing that is simulated follows 'hinge_rad'" in noticed.text
+    assert "the model explains little of the forces that move 'hinge_rad'" in noticed.text

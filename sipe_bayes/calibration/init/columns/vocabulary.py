@@ -8,7 +8,9 @@ GREEK = str.maketrans(
 ANGLES = {"angle", "angles", "theta", "phi", "alpha", "beta", "gamma", "psi", "th", "ang", "rotation", "heading"}
 ANGLES |= {"winkel"}
 LENGTHS = {"x", "y", "z", "displacement", "disp", "distance", "stroke", "travel", "extension", "height"}
-PLACES = {"position", "positions", "pos", "q", "qpos", "enc", "encoder", "joint_pos", "actual", "present", "s", "p"}
+PLACES = {
+    "qm", "position", "positions", "pos", "q", "qpos", "enc", "encoder", "joint_pos", "actual", "present", "s", "p",
+}  # fmt: skip
 PLACES |= {"lage", "stellung"}
 POSITIONS = ANGLES | LENGTHS | PLACES
 ALONG, ABOUT = {"vx", "vy", "vz"}, {"wx", "wy", "wz", "gx", "gy", "gz"}  # velocities of a body
@@ -23,7 +25,7 @@ ACCELERATIONS = PUSHED | {"acceleration", "accelerations", "acc", "accel", "qacc
     "accelerometer",
 }  # fmt: skip
 TORQUES = {"tau", "torque", "torques", "effort", "efforts", "force", "forces", "trq", "f", "moment", "load", "thrust"}
-TORQUES |= {"drehmoment", "kraft"}
+TORQUES |= {"vir", "drehmoment", "kraft"}
 COMMANDS = {"cmd", "command", "commands", "commanded", "u", "ctrl", "control", "controls", "action", "actions"} | {
     "input", "drive", "applied", "a",
 }  # fmt: skip

@@ -179,6 +179,9 @@ def _of_actuator(model: mujoco.MjModel, actuator: Actuator, reading: Reading) ->
         own += [_factor(f"{word}_constant", f"{at}.motor_constant", 0.5, 2.0, f"{constant:g} N m/A in the model")]
         follows = [_factor(f"{word}_kp", f"{at}.kp", 0.3, 3.0, f"position gain, {kp:g} in the model")]
         return follows if actuator.drive == Drive.POSITION else own
+    of_position = float(model.actuator_biasprm[index, 1])
+    if actuator.drive == Drive.POSITION and not np.isclose(gain, -of_position):
+        return [_factor(f"{word}_gain", f"{at}.gain", 0.3, 3.0, f"gain, {gain:g} in the model")]
     if actuator.drive == Drive.POSITION:
         out = [_factor(f"{word}_kp", f"{at}.kp", 0.3, 3.0, f"position gain, {gain:g} in the model")]
         if of_velocity:

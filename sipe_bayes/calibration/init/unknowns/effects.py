@@ -76,7 +76,7 @@ def _left(regression: Regression, theta: FloatArray, late: int) -> FloatArray:
         motion = regression.motion(replace(regression.given, zeros=tuple(bias.tolist())))
     commands = np.concatenate(
         [
-            regression.driven(log, regression.given, width, model)[np.maximum(rows - late, 0)]
+            regression.driven(log, regression.given, width, model)[np.maximum(rows - regression.late(late, log), 0)]
             for log, width, rows in zip(regression.logs, regression.widths, regression.rows, strict=True)
         ]
     )
@@ -102,7 +102,7 @@ def delay_of(
         return [], ""
     targets = tuple(f"actuator:{name}.delay" for name in actuators)
     best, behind = delays[int(np.argmin(outcome.behind))], count * float(outcome.behind[0])
-    may = [d for d, x in zip(delays, count * outcome.behind, strict=True) if x < DECIDED]
+    may = [d for d, x in zip(delays, count * outcome.behind, strict=True) if x < 3 * DECIDED]
     if not best and len(may) == 1:
         return [], "commands arrive at once: a delay would not explain more of the joints' forces"
     if not best or behind < _SHOWN:
