@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -54,6 +55,7 @@ _WELL = 0.1  # of the forces, up to which no other frame is tried
 _EXPLAINED = 0.5  # of the forces, what may be left with a zero that the logs alone tell
 _SPRUNG = 6.0  # nats for each joint, from which springs are believed
 _BELIEVED, _LOOKED = 0.3, 8  # of the forces, up to which no zero is looked for; joints of which the grids are tried
+_LEAST_MOTION = 0.2  # rad, of a hinge whose zero the logs may tell
 _UNSURE = 2.0  # steps of the finest grid
 _SAID = 3  # units that are named
 
@@ -199,8 +201,23 @@ class Search:
 
     @property
     def best(self) -> Answers:
-        """Least nats."""
-        return min(self.tried, key=self.nats)
+        """Least nats; servos turned round against their names only where the model then explains them."""
+        return min(filter(self._is_believed, self.tried), key=self.nats)
+
+    def _is_believed(self, answers: Answers) -> bool:
+        places, miss = {place for place, _ in self.tied.values()}, self.tried[answers][1].miss
+        turned_round = (
+            q.readings[0] for q, a in zip(self.asked, answers, strict=True) if q.of_sign and a != q.answers[0]
+        )
+        return all(k not in places or miss[self.dofs[k]] < _EXPLAINED for k in turned_round)
+
+    @cached_property
+    def dofs(self) -> dict[int, int]:
+        """Degrees of freedom of the positions of joints."""
+        model, readings = self.case.regression.simulator.model, self.case.draft.readings
+        names = {k: r.match.target[6:].rpartition(".")[0] for k, r in enumerate(readings) if not r.commanded}
+        hinges = {joint.name for joint in self.case.machine.joints}
+        return {k: int(model.joint(name).dofadr[0]) for k, name in names.items() if name in hinges}
 
     def nats(self, answers: Answers) -> float:
         """What speaks against answers."""
@@ -223,7 +240,8 @@ class Search:
         """All combinations, or where they are many those that changes of one answer or of two signs lead to."""
         self.add([self.named])
         self._run()
-        self.case.count.append(self.case.regression.independent(self.tried[self.best][1]))
+        outcome = self.tried[self.best][1]
+        self.case.count.append(self.case.regression.independent(outcome))
 
     def _run(self) -> None:
         if np.prod([float(len(question.answers)) for question in self.asked]) <= _ALL:
@@ -243,10 +261,11 @@ class Search:
         rows = [answers for answers in self.tried if answers[question] == answer]
         if not rows:
             return np.inf, None
-        best, now = self.best, self.nats(self.best)
-        near = [a for a in rows if self.nats(a) - now < DECIDED]
-        row = min(near or rows, key=lambda a: (len(_changed(a, best)) * bool(near), self.nats(a)))
-        return float(min(map(self.nats, rows)) - now), row
+        best = self.best
+        told = {a: self.case.nats(self.tried[a][1]) for a in (*rows, best)}  # by the logs alone
+        near = [a for a in rows if told[a] - told[best] < DECIDED]
+        row = min(near or rows, key=lambda a: (len(_changed(a, best)) * bool(near), told[a]))
+        return float(min(told[a] for a in rows) - told[best]), row
 
     def together(self, other: Answers) -> list[int]:
         """Places of the readings whose signs are turned in other answers, commands by their coefficients."""
@@ -311,16 +330,16 @@ def _odd_sizes(case: Case, readings: Readings) -> float:
             odd += (
                 angular and abs(float(np.nanmedian(case.regression.logs[0].observations[:, channel])) * factor) > np.pi
             )
-            odd += _OUTSIDE * _outside(case, now, factor, channel)
+            odd += _OUTSIDE * _outside(case, now, factor, scale_of(now) * (now.zero - then.zero), channel)
     return float(odd)
 
 
-def _outside(case: Case, reading: Reading, factor: float, channel: int) -> float:
+def _outside(case: Case, reading: Reading, factor: float, zero: float, channel: int) -> float:
     """The share of samples beyond the range of a reading's joint, and something where it hardly moves in it."""
     reach = next((j.reach for j in case.machine.joints if reading.match.target == f"joint:{j.name}.position"), None)
     if reach is None:
         return 0.0
-    values = np.concatenate([log.observations[:, channel] for log in case.regression.logs]) * factor
+    values = np.concatenate([log.observations[:, channel] for log in case.regression.logs]) * factor - zero
     room = _BEYOND * (reach[1] - reach[0])
     hardly = _HARDLY * (np.nanmax(values) - np.nanmin(values) < _LITTLE * (reach[1] - reach[0]))
     return float(np.mean((values < reach[0] - room) | (values > reach[1] + room))) + float(hardly)
@@ -571,14 +590,15 @@ def with_zeros(case: Case, model: mujoco.MjModel) -> Draft:
             for value, why in [*_named(model, joint).items(), *((float(v), "") for v in grid)]:
                 for sign, follower in itertools.product((1, -1), {tied.get(k), None}):
                     put = _put_zero(readings, k, follower, value, sign, 0.0)
-                    tried.append((case.nats(case.outcome(put)), k, why, follower, put))
-        named = [one for one in tried if one[2] and case.nats(now) - one[0] > DECIDED]
+                    tried.append((_nats_of(case, put), k, why, follower, put))
+        here = _nats_of(case, readings)
+        named = [one for one in tried if one[2] and here - one[0] > DECIDED]
         best = _best_zero(case, model, joints, readings, named or [one for one in tried if not one[2]])
         if best is None:
             break
         score, k, why, follower, put = best
         then = case.outcome(put)
-        gains = case.nats(now) - score > (DECIDED if why else _ZERO_GAIN)
+        gains = here - score > (DECIDED if why else _ZERO_GAIN)
         if not gains or abs(scale_of(put[k]) * put[k].zero) < _LEAST_ZERO:
             break
         if not why and then.miss[dofs[k]] > min(_EXPLAINED, now.miss[dofs[k]] / _TIMES):
@@ -591,6 +611,10 @@ def with_zeros(case: Case, model: mujoco.MjModel) -> Draft:
 
 Tried = tuple[float, int, str, int | None, list[Reading]]
 """Nats, the place of a reading, why it may have a zero, the set-point that has it too, and all readings."""
+
+
+def _nats_of(case: Case, readings: Readings) -> float:
+    return case.nats(case.outcome(readings)) + _odd_sizes(case, readings)
 
 
 def _best_zero(
@@ -636,8 +660,8 @@ def _refined(
         centre, sign = put[k].zero * scale_of(put[k]), put[k].sign
         unsure = _UNSURE * 2 * width / (_FINER - 1)
         around = [_put_zero(put, k, follower, centre + x, sign, unsure) for x in np.linspace(-width, width, _FINER)]
-        put = min(around, key=lambda one: case.nats(case.outcome(one)))
-    return case.nats(case.outcome(put)), put
+        put = min(around, key=lambda one: _nats_of(case, one))
+    return _nats_of(case, put), put
 
 
 def _range(model: mujoco.MjModel, joint: Joint) -> tuple[float, float]:
@@ -654,7 +678,10 @@ def _grid(case: Case, model: mujoco.MjModel, k: int, joint: Joint) -> FloatArray
         return np.zeros(0)
     low, high = _range(model, joint)
     channel = case.channels[k][0]
-    usual = float(np.median(np.concatenate([log.observations[:, channel] for log in case.regression.logs])))
+    seen = np.concatenate([log.observations[:, channel] for log in case.regression.logs])
+    if joint.hinge and np.ptp(seen) < _LEAST_MOTION:  # from so little no change of gravity shows
+        return np.zeros(0)
+    usual = float(np.median(seen))
     values = usual - np.linspace(low, high, _ZEROS)
     wraps = joint.hinge and not model.jnt_limited[model.joint(joint.name).id]
     return np.asarray((values + np.pi) % (2 * np.pi) - np.pi if wraps else values)

@@ -15,11 +15,12 @@ import numpy as np
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_fields import Use
 from sipe_bayes.calibration.init.columns.match import Match
-from sipe_bayes.calibration.init.columns.names import Kind
+from sipe_bayes.calibration.init.columns.names import Kind, pieces_of
 from sipe_bayes.calibration.init.machine import Drive, Machine
 from sipe_bayes.calibration.init.tables import Clock
 
 Row = dict[str, object]
+_IN_TURNS = {"estimate", "input", "odrive", "turns"}  # words of columns that drives log in turns
 _WIDE = 1.5  # sd of the logarithm of what a regression says of a gain
 
 
@@ -301,6 +302,7 @@ class Question:
 def unit_words(reading: Reading, machine: Machine) -> tuple[str, ...]:
     """The units that a column without one in its name may have, the likeliest first."""
     target, kind = reading.match.target, reading.match.label.kind
+    turns = bool(_IN_TURNS & {*pieces_of(reading.match.column)})
     if target.startswith("body:"):
         return ("m", "mm", "cm") if target.endswith(".position") else (reading.unit,)
     if target.startswith("sensor:"):
@@ -308,14 +310,14 @@ def unit_words(reading: Reading, machine: Machine) -> tuple[str, ...]:
     if target.startswith("joint:"):
         joint = next(j for j in machine.joints if target.startswith(f"joint:{j.name}."))
         if target.endswith(".position"):
-            return ("rad", "deg", "rev") if joint.hinge else ("m", "mm", "cm")
-        return ("rad/s", "deg/s", "rpm", "rev/s") if joint.hinge else ("m/s", "mm/s")
+            return ("rad", "deg", *["rev"] * turns) if joint.hinge else ("m", "mm", "cm")
+        return ("rad/s", "deg/s", "rpm", *["rev/s"] * turns) if joint.hinge else ("m/s", "mm/s")
     actuator = next(a for a in machine.actuators if target == f"actuator:{a.name}")
     hinge = actuator.turns
     if actuator.drive == Drive.POSITION:
-        return ("rad", "deg", "rev") if hinge else ("m", "mm", "cm")
+        return ("rad", "deg", *["rev"] * turns) if hinge else ("m", "mm", "cm")
     if actuator.drive == Drive.VELOCITY:
-        return ("rad/s", "deg/s", "rpm", "rev/s") if hinge else ("m/s", "mm/s")
+        return ("rad/s", "deg/s", "rpm", *["rev/s"] * turns) if hinge else ("m/s", "mm/s")
     if kind == Kind.CURRENT:
         return ("A", "mA")
     if kind == Kind.DUTY:

@@ -27,6 +27,7 @@ from sipe_bayes.core.units import find_unit, unit_words
 _FOLLOWS = 0.3  # share of variance from which a column is the force of a drive, whose gains may be off
 _UNSURE, _FAR = np.log(1.5), np.log(6.0)  # of the logarithm of how many times the model's force it is
 _FEWEST = 20  # rows
+_BOTH_WAYS = 0.1  # of the rows, in which a force that changes its sign has either
 
 
 def with_forces(
@@ -57,8 +58,6 @@ def with_forces(
     outcome, motion = regression.fit(regression.given), regression.given_motion
     damping = regression.simulator.model.dof_damping
     seen = motion.asked + damping * motion.speed + outcome.friction * turning_of(motion.speed)
-    nq, nv = model.nq, model.nv
-    seen = seen + outcome.armature * motion.states[:, nq + nv : nq + 2 * nv]
     place = sum(len(m.channels) for m in draft.config(folder).measurements)
     logs = [log.slice(0, len(own)) for log, own in zip(loaded(whole, sources, folder), regression.logs, strict=True)]
     measured = np.concatenate(
@@ -67,9 +66,13 @@ def with_forces(
             for log, width, rows in zip(logs, regression.widths, regression.rows, strict=True)
         ]
     )
-    readings = []
+    readings, sizes = [], len(first) > 1 and not (measured < 0).any()
     for k, reading in enumerate(first):
         dof = int(model.joint(_joint(reading)).dofadr[0])
+        both_ways = min(np.mean(seen[:, dof] > 0), np.mean(seen[:, dof] < 0)) > _BOTH_WAYS
+        if (both_ways or sizes) and not (measured[:, k] < 0).any():
+            notes.append(f"{reading.match.column!r} is not used: it never changes its sign")
+            continue
         decided = _decided(reading, _likeness(seen[:, dof], measured[:, k]))
         if decided.fit:
             readings.append(decided)

@@ -41,7 +41,7 @@ _LATE_GYRO = 0.06  # s, that a gyro may be late
 _STOP = 0.01  # of a joint's range, within which it is at its end
 _GAP = 0.7  # of the gap between measured samples, the least kernel
 _FREE = 0.2  # of the rows, so few of which are no better than all
-_WORST = 10.0  # and the most
+WORST = 10.0  # and the most
 _ZERO = 0.1  # rad of a zero's error, or a tenth of a constant force
 _DRY = 0.1  # of the usual speed, up to which dry friction turns round
 
@@ -109,7 +109,6 @@ class Outcome:
         errors: (A,) standard errors of these.
         damping: (V,) force per velocity.
         friction: (V,) level of dry friction.
-        armature: (V,) inertia of rotors and gears beside the model's.
         delay: samples, between those that were tried.
         behind: (D,) of each delay that was tried, by how much more is left than at the best: sum of logarithms.
         unexplained: the sum of the logarithms of what is left: the smaller the better.
@@ -124,7 +123,6 @@ class Outcome:
     errors: FloatArray
     damping: FloatArray
     friction: FloatArray
-    armature: FloatArray
     delay: float
     behind: FloatArray
     unexplained: float
@@ -165,6 +163,9 @@ class Regression:
         self.count = sum(map(len, self.logs)) / self.period * _PERIODS
         some = zip(self.logs, self.states, gaps, strict=True)
         self.widths = [max(self._width(log, states), _GAP * gap) for log, states, (_, gap) in some]
+        for k, (states, width) in enumerate(zip(self.states, self.widths, strict=True)):
+            stopped = _stopped(model, states[:, 1 : 1 + model.nq])  # whose forces no regression knows
+            self._seen[k] = self._seen[k] & ~maximum_filter1d(stopped, int(6 * width) + 1)
         self.rows = self._chosen()
         self.known = self._measured()
         self.scales: list[tuple[float, ...]] = [(1.0,)] * len(self.actuators)
@@ -179,13 +180,12 @@ class Regression:
     def motion(self, assumption: Assumption) -> Motion:
         """What the model asks for and its actuators give under an assumption."""
         model, data = self.plain, self._data
-        states, given, loose = [], [], []
+        states, given = [], []
         for log, own, width, rows in zip(self.logs, self.states, self.widths, self.rows, strict=True):
             read = self._read(log, own, assumption)
             states.append(_derived(model, read, log.dt, width, self.simulator.physics_steps(log.dt)[0])[rows])
             commands = self.driven(log, assumption, width, self.simulator.model)
             given.append(np.stack([commands[np.maximum(rows - self.late(d, log), 0)] for d in self.delays]))
-            loose.append(~maximum_filter1d(_stopped(model, read), int(6 * width) + 1)[rows])
         flat, commands = np.concatenate(states), np.concatenate(given, axis=1)  # (R, S), (D, R, A)
         count, nq, nv = len(flat), model.nq, model.nv
         asked, inertial = np.zeros((2, count, nv))
@@ -208,7 +208,7 @@ class Regression:
                 turned[g, k] = spin[:3]
         forces = self._forces(commands, lengths, rates)
         seen = [own[rows] for own, rows in zip(self._seen, self.rows, strict=True)]
-        free = np.concatenate(seen) & np.concatenate(loose)
+        free = np.concatenate(seen)
         if may_touch(self.simulator.model):
             free &= ~_touches(self.simulator.model, flat[:, :nq])
         free |= free.mean() < _FREE
@@ -224,7 +224,7 @@ class Regression:
         if not len(dofs):
             none, gains = np.ones(motion.usable.shape), np.zeros(len(self.actuators))
             rest = 0.0, np.zeros(len(self.delays)), 0.0, 0.0, np.zeros_like(motion.asked), size
-            return Outcome(none, gains, gains + np.inf, 0 * none, 0 * none, 0 * none, *rest)
+            return Outcome(none, gains, gains + np.inf, 0 * none, 0 * none, *rest)
         costs, last = np.full(len(self.delays), np.inf), len(self.delays) - 1
         left = list(range(0, last + 1, 1 if every else 3))
         while left:  # down to the best of its neighbours
@@ -249,37 +249,33 @@ class Regression:
             sizes = [max(f * np.sqrt((seen**2).mean()), np.sqrt((model**2).mean()), 1e-12) for f in gyro.factors]
             away = [np.sqrt(((f * seen - model) ** 2).mean()) for f in gyro.factors]
             left.append(np.divide(away, sizes))
-        return np.clip(np.min(left, axis=0), _BEST, _WORST)
+        return np.clip(np.min(left, axis=0), _BEST, WORST)
 
     def _solved(self, motion: Motion, delay: int, dofs: IntArray, sizes: FloatArray, told: bool = False) -> Outcome:
         """At one delay, gains of any sign, friction of none but its own; told: with errors."""
         size, free = sizes[dofs], motion.free
         count, n, actuators = len(motion.asked), len(dofs), len(self.actuators)
         usual = np.sqrt((motion.speed[:, dofs] ** 2).mean(0)) + 1e-12
-        faster = motion.states[:, self.plain.nq + self.plain.nv :][:, dofs]
-        pace = np.sqrt((faster**2).mean(0)) + 1e-12
-        columns = np.zeros((count, n, actuators + (6 if self.springs else 4) * n))
+        columns = np.zeros((count, n, actuators + (5 if self.springs else 3) * n))
         columns[..., :actuators] = motion.given[delay][:, dofs] / size[:, None]
         turning = turning_of(motion.speed[:, dofs])
         for k in range(n):
             columns[:, k, actuators + k] = -motion.speed[:, dofs[k]] / usual[k]
             columns[:, k, actuators + n + k] = -turning[:, k]
             columns[:, k, actuators + 2 * n + k] = 1.0
-            columns[:, k, actuators + 3 * n + k] = -faster[:, k] / pace[k]
             if self.springs and (place := self._places[dofs[k]]) >= 0:
                 own = motion.states[:, place] - motion.states[:, place].mean()
-                columns[:, k, actuators + 4 * n + k] = -own / (own.std() + 1e-12)
-                columns[:, k, actuators + 5 * n + k] = 1.0  # it rests anywhere
+                columns[:, k, actuators + 3 * n + k] = -own / (own.std() + 1e-12)
+                columns[:, k, actuators + 4 * n + k] = 1.0  # it rests anywhere
         wanted = (motion.asked[:, dofs] / size * free[:, None]).ravel()
         columns *= free[:, None, None]
         design = columns.reshape(count * n, -1)
         loose = np.array([drive not in (Drive.POSITION, Drive.VELOCITY) for drive in self.drives], bool)
         held = motion.asked - motion.inertial
         rest = _ZERO * np.sqrt((held[:, dofs] ** 2).mean(0)) / size  # what a zero that is a little off changes
-        low = np.concatenate(
-            [np.where(loose & ~self.one_way, -np.inf, 0.0), np.zeros(2 * n), -rest - 1e-9, np.zeros(n)]
-        )
-        high = np.concatenate([np.full(actuators + 2 * n, np.inf), rest + 1e-9, np.full(n, np.inf)])
+        least = np.where(loose & ~self.one_way, -np.inf, 0.0)
+        low = np.concatenate([least, np.zeros(2 * n), -rest - 1e-9])
+        high = np.concatenate([np.full(actuators + 2 * n, np.inf), rest + 1e-9])
         if self.springs:
             low, high = np.append(low, [0.0] * n + [-np.inf] * n), np.append(high, [np.inf] * 2 * n)
         scale = np.sqrt((design**2).sum(0)) + 1e-12
@@ -287,11 +283,10 @@ class Regression:
         found = scipy.optimize.lsq_linear(short, rotated, (low * scale, high * scale), method="bvls").x / scale
         left = (wanted - design @ found).reshape(count, n)
         miss = np.clip(np.sqrt((left**2).sum(0) / free.sum()), _BEST, None)
-        whole, (damping, friction, armature) = np.ones(motion.usable.shape), np.zeros((3, *motion.usable.shape))
+        whole, (damping, friction) = np.ones(motion.usable.shape), np.zeros((2, *motion.usable.shape))
         whole[dofs] = miss
         damping[dofs] = found[actuators : actuators + n] * size / usual
         friction[dofs] = found[actuators + n : actuators + 2 * n] * size
-        armature[dofs] = found[actuators + 3 * n : actuators + 4 * n] * size / pace
         shares = np.zeros_like(motion.asked)
         shares[:, dofs] = left
         gains = found[:actuators]
@@ -301,8 +296,8 @@ class Regression:
             alike = count / self._independent(left)
             spread = np.linalg.inv(weighted.T @ weighted + _ROUNDING * np.eye(len(scale))) * alike
             errors = np.sqrt(np.diag(spread)[:actuators]) / scale[:actuators]
-        both = float(np.log(np.minimum(miss, _WORST)).sum()), self._far_off(gains)
-        return Outcome(whole, gains, errors, damping, friction, armature, 0.0, np.zeros(0), *both, shares, sizes)
+        both = float(np.log(np.minimum(miss, WORST)).sum()), self._far_off(gains)
+        return Outcome(whole, gains, errors, damping, friction, 0.0, np.zeros(0), *both, shares, sizes)
 
     def independent(self, outcome: Outcome) -> float:
         """How many independent numbers of each degree of freedom the rows hold, by the correlation of what is left."""

@@ -57,12 +57,10 @@ def informed(
                 own = bind(model, unknown.targets[0]).value
                 values[unknown.name] = gain * own
                 unknown = _around_gain(unknown, gain, own)
-        elif kind == "joint" and field in ("damping", "frictionloss", "armature") and not unknown.relative:
+        elif kind == "joint" and field in ("damping", "frictionloss") and not unknown.relative:
             dof = int(model.joint(name).dofadr[0])
             if regression.known[dof]:
-                own = float(model.dof_armature[dof])
-                values_of = {"damping": outcome.damping, "frictionloss": outcome.friction}
-                value = float(values_of.get(field, own + outcome.armature)[dof])
+                value = float((outcome.damping if field == "damping" else outcome.friction)[dof])
                 values[unknown.name] = value
                 unknown = replace(unknown, high=max(unknown.high, rounded_up(_ROOM * value) if value else 0.0))
         out.append(unknown)
