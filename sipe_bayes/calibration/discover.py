@@ -16,8 +16,8 @@ from sipe_bayes.calibration.run import run_name
 from sipe_bayes.core.validation import at_least
 from sipe_bayes.diagnostics.discovery import Discovery
 from sipe_bayes.inference.recorded import Progress
-from sipe_bayes.structure.discover import Restriction, SearchInterrupted, check_restriction
-from sipe_bayes.structure.discover import discover as search
+from sipe_bayes.structure.discovery import Restriction, SearchInterrupted, check_restriction
+from sipe_bayes.structure.discovery import discover as search
 from sipe_bayes.structure.state import BUDGET, DiscoverOptions
 from sipe_bayes.structure.structures import Structures
 

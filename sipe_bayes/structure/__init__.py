@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from sipe_bayes.core.lazy import exports
 
 if TYPE_CHECKING:
-    from sipe_bayes.structure.discover import Restriction as Restriction
-    from sipe_bayes.structure.discover import discover as discover
+    from sipe_bayes.structure.discovery import Restriction as Restriction
+    from sipe_bayes.structure.discovery import discover as discover
     from sipe_bayes.structure.extension import Extension as Extension
     from sipe_bayes.structure.extension import Placed as Placed
     from sipe_bayes.structure.state import DiscoverOptions as DiscoverOptions

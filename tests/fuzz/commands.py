@@ -30,6 +30,7 @@ TEXTS = (
 )
 FIRST: dict[str, list[str]] = {
     "init": ["pendulum.xml", "log.csv"],
+    "validate": ["config.toml"],
     "calibrate": ["config.toml"],
     "discover": ["config.toml"],
     "check": ["config.toml", "laplace"],

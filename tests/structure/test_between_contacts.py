@@ -11,7 +11,7 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood import Segments, bind
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.discover import LEAST_SPAN, Restriction, discover
+from sipe_bayes.structure.discovery import LEAST_SPAN, Restriction, discover
 
 DT, SD = 0.01, 0.001
 XML = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>

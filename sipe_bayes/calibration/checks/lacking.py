@@ -23,7 +23,7 @@ from sipe_bayes.inference.base import Estimator
 from sipe_bayes.likelihood import QuadraticPrior, StateSpace
 from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.structure.augmented import AugmentedModel
-from sipe_bayes.structure.discover import FEWEST_APART
+from sipe_bayes.structure.discovery import FEWEST_APART
 from sipe_bayes.structure.discrepancy import Discrepancy, LogEstimate, draw_differing, find_discrepancy
 from sipe_bayes.structure.extensions.numerics import PhysicsStep
 
