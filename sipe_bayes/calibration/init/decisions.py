@@ -587,10 +587,13 @@ def with_zeros(case: Case, model: mujoco.MjModel) -> Draft:
         tried = []
         for k, joint in joints.items():
             grid = _grid(case, model, k, joint) if k in shown else np.zeros(0)
-            for value, why in [*_named(model, joint).items(), *((float(v), "") for v in grid)]:
-                for sign, follower in itertools.product((1, -1), {tied.get(k), None}):
-                    put = _put_zero(readings, k, follower, value, sign, 0.0)
-                    tried.append((_nats_of(case, put), k, why, follower, put))
+            values = [(v, why, tied.get(k)) for v, why in _named(model, joint).items()]
+            values += [(float(v), "", tied.get(k)) for v in grid]
+            if len(grid) and k in tied:  # of the encoder alone, by which it is off the set-points
+                values.append((_apart(case, k, tied[k]), "", None))
+            for (value, why, follower), sign in itertools.product(values, (1, -1)):
+                put = _put_zero(readings, k, follower, value, sign, 0.0)
+                tried.append((_nats_of(case, put), k, why, follower, put))
         here = _nats_of(case, readings)
         named = [one for one in tried if one[2] and here - one[0] > DECIDED]
         best = _best_zero(case, model, joints, readings, named or [one for one in tried if not one[2]])
@@ -611,6 +614,14 @@ def with_zeros(case: Case, model: mujoco.MjModel) -> Draft:
 
 Tried = tuple[float, int, str, int | None, list[Reading]]
 """Nats, the place of a reading, why it may have a zero, the set-point that has it too, and all readings."""
+
+
+def _apart(case: Case, k: int, follower: int) -> float:
+    """By how much, SI, a position is usually off its set-point."""
+    command, channel = case.commands[follower], case.channels[k][0]
+    assert command is not None
+    parts = [log.observations[:-1, channel] - log.actions[:, command] for log in case.regression.logs]
+    return float(np.median(np.concatenate(parts)))
 
 
 def _nats_of(case: Case, readings: Readings) -> float:

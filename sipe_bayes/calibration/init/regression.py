@@ -273,6 +273,8 @@ class Regression:
         loose = np.array([drive not in (Drive.POSITION, Drive.VELOCITY) for drive in self.drives], bool)
         held = motion.asked - motion.inertial
         rest = _ZERO * np.sqrt((held[:, dofs] ** 2).mean(0)) / size  # what a zero that is a little off changes
+        kinds = self.simulator.model.actuator_dyntype[self.actuators] == int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
+        rest[motion.given[delay][:, dofs][..., kinds].any(axis=(0, 2))] = np.inf  # where integrators begin
         least = np.where(loose & ~self.one_way, -np.inf, 0.0)
         low = np.concatenate([least, np.zeros(2 * n), -rest - 1e-9])
         high = np.concatenate([np.full(actuators + 2 * n, np.inf), rest + 1e-9])
