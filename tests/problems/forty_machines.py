@@ -165,8 +165,8 @@ def asks(draft: Draft, column: str, *words: str) -> bool:
 
 
 def turned_together(draft: Draft, truths: Sequence[Column], wrong: set[str]) -> bool:
-    """Whether the signs that are wrong are those of columns that are told to be turned round together, or alone."""
-    parts = [part for d in draft.open_doubts if "turned round together" in d for part in d.split(";")]
+    """Whether the signs that are wrong are those of columns that are named as flipped together, or alone."""
+    parts = [part for d in draft.open_doubts if "flipped together" in d for part in d.split(";")]
     groups = [{t.name for t in truths if repr(t.name) in part} for part in parts]
     groups += [{t.name} for t in truths if asks(draft, t.name, f"sign = {t.sign}", "its sign does not show")]
     turned = [set[str]()]

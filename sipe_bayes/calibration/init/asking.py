@@ -35,8 +35,8 @@ def choices_of(draft: Draft) -> list[Choice]:
     for turned_columns in draft.together:
         group = [k for k, reading in enumerate(draft.readings) if reading.match.column in turned_columns]
         names = " and ".join(map(repr, turned_columns))
-        text = f"{names}: the logs do not tell whether they are turned round together"
-        out.append(Choice(text, ("as proposed", "turned round"), (lambda d: d, _turned(group))))
+        text = f"{names}: sign ambiguity: flipped together they fit equally well"
+        out.append(Choice(text, ("as proposed", "flipped"), (lambda d: d, _turned(group))))
     return out
 
 

@@ -201,7 +201,7 @@ class Search:
 
     @property
     def best(self) -> Answers:
-        """Least nats; servos turned round against their names only where the model then explains them."""
+        """Least nats; servos flipped against their names only where the model then explains them."""
         return min(filter(self._is_believed, self.tried), key=self.nats)
 
     def _is_believed(self, answers: Answers) -> bool:
@@ -440,7 +440,7 @@ def _with_evidence(search: Search, q: int, readings: list[Reading]) -> None:
             beside = "all moves alike where the others that belong to it are turned too"
             _put(readings, question, f"sign {answer}: alone it can not be turned, but {beside}", "", "")
         else:
-            _put(readings, question, f"sign {answer}: turned round, {times:.2g} times as much of the joints' "
+            _put(readings, question, f"sign {answer}: flipped, {times:.2g} times as much of the joints' "
                  "forces is left unexplained", "", "")  # fmt: skip
     if rejected:
         _put(readings, question, missing_more(answer, rejected), "", "")
@@ -473,7 +473,7 @@ def as_well(answer: Answer, rivals: Sequence[tuple[Scale, float]]) -> str:
 
 
 def _mirrored(search: Search) -> list[tuple[int, ...]]:
-    """Places of readings whose signs may be turned round together, and of what drives them."""
+    """Places of readings whose signs may be flipped together, and of what drives them."""
     groups = dict[tuple[int, ...], None]()
     for q, question in enumerate(search.asked):
         gap, row = search.gap(q, turned(search.best[q])) if question.of_sign else (np.inf, None)
@@ -485,7 +485,7 @@ def _mirrored(search: Search) -> list[tuple[int, ...]]:
 def _said(groups: Sequence[Sequence[int]], readings: Readings) -> list[str]:
     pairs = [" and ".join(repr(readings[k].match.column) for k in one) for one in groups]
     each = "" if len(pairs) == 1 else "each of "
-    text = f"all moves alike with {each}{'; '.join(pairs)} turned round together: only how they go together is known"
+    text = f"sign ambiguity: the logs fit equally well with {each}{'; '.join(pairs)} flipped together"
     return [text] if pairs else []
 
 

@@ -213,7 +213,7 @@ class Draft:
         delay: of the commands, in samples.
         seconds: that a calibration may take; 0 where nothing says it.
         tied: columns of positions, each with that of the set-point that it follows.
-        together: columns that may be turned round together, in groups.
+        together: columns that may be flipped together, in groups.
         names: of columns without a header.
     """
 

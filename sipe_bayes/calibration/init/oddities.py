@@ -199,7 +199,7 @@ def _steps(case: Case, model: mujoco.MjModel) -> Iterator[Oddity]:
             f'<option timestep="{step:g}"/>, or look at kp',
         )  # fmt: skip
     if told * dt > _SLOW * np.pi:
-        yield Oddity("slow", f"the log's {1 / dt:.3g} Hz are slower than the servos move: gains are hardly told by it")
+        yield Oddity("slow", f"the log's {1 / dt:.3g} Hz are slower than the servos: gains are weakly identifiable")
 
 
 def _inertias(model: mujoco.MjModel) -> Iterator[Oddity]:

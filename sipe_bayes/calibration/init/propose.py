@@ -408,7 +408,7 @@ def _some(unknowns: list[Unknown]) -> tuple[list[Unknown], list[str]]:
         return unknowns, doubts
     if not unknowns:
         return [], ["nothing of the model could be proposed as unknown; add [[parameters]] by hand"]
-    doubt = "no unknown shows in these logs, so all are asked for; look at the log and at the model"
+    doubt = "no parameter is identifiable in these logs, so all are free; look at the log and at the model"
     return [replace(unknown, left_out="") for unknown in unknowns], [doubt]
 
 

@@ -27,7 +27,7 @@ def test_signs_that_go_together_are_turned_together(tmp_path: Path) -> None:
 
     def turn(text: str, answers: Sequence[str]) -> int:
         shown.append(text)
-        return answers.index("turned round") if "turned round" in answers else 0
+        return answers.index("flipped") if "flipped" in answers else 0
 
     done = asked(draft, turn)
     assert len(shown) == 1

@@ -41,10 +41,10 @@ def mirrored(folder: Path) -> Draft:
 
 def test_what_gravity_hardly_tells_stays_open(tmp_path: Path) -> None:
     draft = mirrored(tmp_path)
-    (doubt,) = [doubt for doubt in draft.open_doubts if "turned round together" in doubt]
+    (doubt,) = [doubt for doubt in draft.open_doubts if "flipped together" in doubt]
     assert "'pan_position_rad' and 'pan_goal_rad'" in doubt, draft.open_doubts
     signs = {reading.match.column: reading.sign for reading in draft.readings}
     assert (signs["lift_position_rad"], signs["lift_goal_rad"]) == (-1, -1), signs
     notes = [note for r in draft.readings if "lift" in r.match.column for note in r.notes if note.startswith("sign")]
     assert notes
-    assert all("turned round" in note or "follows it" in note for note in notes), notes
+    assert all("flipped" in note or "follows it" in note for note in notes), notes

@@ -36,7 +36,7 @@ def wrong(draft: Draft, truth: Truth) -> list[str]:
         signs.append(reading.sign * sign)
     if len(set(signs)) > 1:
         out.append(f"signs {signs} of {list(truth.columns)}")
-    elif signs[0] < 0 and not any("turned round together" in doubt for doubt in draft.open_doubts):
+    elif signs[0] < 0 and not any("flipped together" in doubt for doubt in draft.open_doubts):
         out.append("a mirror image, and nothing is told")
     if (draft.clock.column, draft.clock.unit) != truth.clock:
         out.append(f"clock {draft.clock}")
@@ -111,7 +111,7 @@ def test_where_nothing_shows_all_is_asked_for(tmp_path: Path) -> None:
     pd.DataFrame({"time": time, "angle": still, "torque": 0.0 * time}).to_csv(tmp_path / "log.csv", index=False)
     draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
     assert draft.proposed
-    assert any("all are asked for" in doubt for doubt in draft.open_doubts)
+    assert any("all are free" in doubt for doubt in draft.open_doubts)
 
 
 @pytest.fixture(scope="module")

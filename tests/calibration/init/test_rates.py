@@ -74,7 +74,7 @@ def test_a_gyro_tells_counts_and_signs(tmp_path: Path) -> None:
         reading = by_column(draft)[column]
         assert (reading.unit, round(1 / reading.factor), reading.sign) == ("rev", 20000, sign), reading
         assert any("20000 counts a rev" in text for text in (*reading.notes, *reading.doubts)), reading
-        assert any(f"sign {sign}: turned round" in note for note in reading.notes), reading
+        assert any(f"sign {sign}: flipped" in note for note in reading.notes), reading
     assert by_column(draft)["luff_cmd_rad_s"].sign == 1
     assert not [d for d in draft.open_doubts if "enc" in d and ("sign" in d or "turned" in d)]
 
@@ -113,7 +113,7 @@ def test_counts_that_nobody_uses_are_told(tmp_path: Path) -> None:
 def test_without_a_gyro_simulations_alone_tell(tmp_path: Path) -> None:
     draft = proposed(tmp_path, counted(moved(0.0), 20000, 20000), sensor="")
     assert not any("gyro" in text for r in draft.readings for text in (*r.notes, *r.doubts))
-    assert any("turned round together" in doubt for doubt in draft.open_doubts), draft.open_doubts
+    assert any("flipped together" in doubt for doubt in draft.open_doubts), draft.open_doubts
 
 
 def test_a_gyro_that_is_mounted_otherwise_does_not_decide_against_gravity(tmp_path: Path) -> None:
