@@ -8,11 +8,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from sipe_bayes.calibration.checks.followed import not_followed
 from sipe_bayes.calibration.discovered import write_discovery
 from sipe_bayes.calibration.discovery_summary import summarise
 from sipe_bayes.calibration.output import CHECKPOINT, IDENTITY, claimed, describe_run
 from sipe_bayes.calibration.problem import Problem, prepare
 from sipe_bayes.calibration.run import run_name
+from sipe_bayes.core.telling import Tell, silent
 from sipe_bayes.core.validation import at_least
 from sipe_bayes.diagnostics.discovery import Discovery
 from sipe_bayes.inference.recorded import Progress
@@ -106,6 +108,7 @@ def run_discovery(
     num_threads: int | None = None,
     progress: Progress | None = None,
     time_limit: float | None = None,
+    warn: Tell = silent,
 ) -> Discovery:
     """What the command does: read, claim the output folder, search with a checkpoint, write everything.
 
@@ -122,6 +125,7 @@ def run_discovery(
         num_threads: native ones; default all cores.
         progress: called along the way.
         time_limit: s of the search, as of ``discover``.
+        warn: called before the search with a line for each column of which the model explains nothing.
 
     Raises:
         ValueError: for input that cannot be used; the message is one line with the remedy.
@@ -139,6 +143,9 @@ def run_discovery(
         "without": list(restriction.without),
         "extensions_sha256": restriction.digests,
     }
+    unexplained = not_followed(problem)
+    for item in unexplained:
+        warn(item.text)
     with claimed(folder, {**record, "status": "started"}, keys=_KEYS):
         try:
             structures = discover(
@@ -162,6 +169,8 @@ def run_discovery(
 
         try:
             discovery = summarise(problem, structures, name, chosen, began, tell)
-            return write_discovery(replace(discovery, run=record, out=str(folder)), structures, problem, folder)
+            findings = (*unexplained, *discovery.findings)
+            discovery = replace(discovery, findings=findings, run=record, out=str(folder))
+            return write_discovery(discovery, structures, problem, folder)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(structures.so_far) from None

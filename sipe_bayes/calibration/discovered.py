@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from sipe_bayes.diagnostics.discovery import Discovery
 from sipe_bayes.envs.export import ExportError, write_edited, write_identified
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.report.discovery.page import write_discovery_report
-from sipe_bayes.structure.columns import Column
 from sipe_bayes.structure.extension import Placed
 from sipe_bayes.structure.structures import Structures
 
@@ -91,7 +89,7 @@ def write_configuration(problem: Problem, structures: Structures, folder: Path, 
     """
     placed = structures.placed(structures.best)
     data = problem.config.model_dump(mode="json", by_alias=True, exclude_unset=True)
-    data = _set_right(_relocated(data, folder), structures.columns) | {"seed": seed}
+    data = _relocated(data, folder) | {"seed": seed}
     if any(one.edit is not None for one in placed):
         write_edited(_environment(structures), folder / EXTENDED_XML)
         data["model"] = EXTENDED_XML
@@ -102,24 +100,9 @@ def write_configuration(problem: Problem, structures: Structures, folder: Path, 
     data["structure"] = {**data.get("structure", {}), "weight": max(float(f"{weight:.3g}"), 1e-3)}
     data["search"] = {**data.get("search", {}), "start": dict(values)}
     remarks = [f"{problem.config.path.name} with what `sipe discover` put in; run it from anywhere:"]
-    remarks += [f"  sipe calibrate {folder / DISCOVERED_TOML}", *(x.sentence for x in structures.columns)]
+    remarks.append(f"  sipe calibrate {folder / DISCOVERED_TOML}")
     lines = [f"# {printed(remark)}" for remark in (*remarks, *(one.sentence for one in placed))]
     write_text(folder / DISCOVERED_TOML, "\n".join(lines) + "\n\n" + to_toml(data))
-
-
-def _set_right(data: dict[str, Any], columns: Sequence[Column]) -> dict[str, Any]:
-    """The configuration's data with ``sign`` and ``factor`` of columns that are to be multiplied."""
-    out = {**data}
-    for column in columns:
-        table, key = ("commands", "actuator") if column.command else ("measurements", "name")
-
-        def multiplied(row: dict[str, Any], by: float = column.factor) -> dict[str, Any]:
-            if by < 0:
-                return {**row, "sign": -row.get("sign", 1)}
-            return {**row, "factor": by * row.get("factor", 1.0)}
-
-        out[table] = [multiplied(row) if row.get(key, row.get("column")) == column.name else row for row in out[table]]
-    return out
 
 
 def _relocated(data: dict[str, Any], folder: Path) -> dict[str, Any]:

@@ -36,7 +36,6 @@ from sipe_bayes.likelihood import BoundLikelihood, QuadraticPrior
 from sipe_bayes.posterior import Particles
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.structure.augmented import AugmentedModel
-from sipe_bayes.structure.columns import corrected
 from sipe_bayes.structure.comparison import difference, rank
 from sipe_bayes.structure.discrepancy import Discrepancy, find_discrepancy
 from sipe_bayes.structure.fitted import FittedStructure
@@ -47,7 +46,6 @@ _NAMED = 3  # of what was not tried
 _LARGER = 2  # times the budget that did not reach: what to try next
 _BEFORE = {
     Phase.PLAIN: "the model as it is was fitted to the end",
-    Phase.COLUMNS: "any piece was tried",
     Phase.RANK: "what the model may lack was ranked",
     Phase.FIT: "all extensions with a predicted gain were fitted",
     Phase.PRUNE: "each extension of the best structure was left out once",
@@ -81,7 +79,6 @@ def summarise(
     added = [p for label in unknown for p in _added(structures, label, further, seed)]
     return Discovery(
         name=name,
-        columns=tuple(column.sentence for column in structures.columns),
         rows=tuple(structures.table()),
         pieces=_pieces(structures),
         promises=_promises(structures),
@@ -100,7 +97,6 @@ def summarise(
         best_settled=structures.best.settled,
         ended=structures.search.ended if structures.state.cut is not None else "",
         rollouts=structures.rollouts,
-        column_rollouts=structures.state.column_rollouts,
         seconds=time.monotonic() - began,
         findings=(
             *_budget_spent(structures),
@@ -111,23 +107,17 @@ def summarise(
 
 
 def _budget_spent(structures: Structures) -> list[Finding]:
-    """What the budget did not reach: the end of the search, or all signs and units of columns."""
-    state, budget, noticed = structures.state, structures.search.budget, []
-    larger = _LARGER * budget
-    if state.cut in _BEFORE:
-        why, remedy = {
-            "budget": (f"with its budget of {budget} rollouts", f"give --budget {larger}"),
-            "time": ("at its time limit", "give a longer --time-limit"),
-            "interrupted": ("when it was interrupted", "run the same command"),
-        }[structures.search.ended]
-        before, untried = _BEFORE[state.cut], _untried(structures)
-        cut = finding(Code.STRUCTURES_CUT_SHORT, why=why, before=before, untried=untried, remedy=remedy)
-        noticed.append(cut)
-    if state.untried:
-        count, example = len(state.untried), state.untried[0].sentence
-        untold = finding(Code.COLUMNS_UNTRIED, count=count, example=example, budget=budget, larger=larger)
-        noticed.append(untold)
-    return noticed
+    """That the search was cut short, where it was."""
+    state, budget = structures.state, structures.search.budget
+    if state.cut not in _BEFORE:
+        return []
+    why, remedy = {
+        "budget": (f"with its budget of {budget} rollouts", f"give --budget {_LARGER * budget}"),
+        "time": ("at its time limit", "give a longer --time-limit"),
+        "interrupted": ("when it was interrupted", "run the same command"),
+    }[structures.search.ended]
+    before, untried = _BEFORE[state.cut], _untried(structures)
+    return [finding(Code.STRUCTURES_CUT_SHORT, why=why, before=before, untried=untried, remedy=remedy)]
 
 
 def _untried(structures: Structures) -> str:
@@ -135,7 +125,7 @@ def _untried(structures: Structures) -> str:
     state, search = structures.state, structures.search
     if state.cut is Phase.FIT:
         names = [" with ".join(search.placed[label].sentence for label in labels) for labels in state.queue]
-    elif state.cut in (Phase.PLAIN, Phase.COLUMNS, Phase.RANK):
+    elif state.cut in (Phase.PLAIN, Phase.RANK):
         there = structures.best.labels
         names = [p.sentence for p in search.placed.values() if p.label not in there]
     else:
@@ -169,11 +159,9 @@ class _Model:
     asks_all: bool = True
 
     def windows(self, logs: Trajectories, like: BoundLikelihood | None = None) -> BoundLikelihood:
-        """By which logs are scored and drawn, their columns multiplied as those of the fits were."""
-        logs = corrected(logs, self.structures.columns, self.problem.environment.actuators)
-        return BoundLikelihood(
-            replace(self.problem.segments, fit=None), self.structures.simulator(self.one), logs, like
-        )
+        """By which logs are scored and drawn."""
+        segments = replace(self.problem.segments, fit=None)
+        return BoundLikelihood(segments, self.structures.simulator(self.one), logs, like)
 
     def predicted(self, windows: BoundLikelihood) -> FloatArray:
         """Predictions (W, L, C) from measured starts."""

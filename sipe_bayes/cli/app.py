@@ -32,6 +32,7 @@ from sipe_bayes.cli.errors import (
     check_words,
     exit_code_of,
     exit_on_error,
+    say_early,
     say_interrupted,
     was_announced,
 )
@@ -113,10 +114,6 @@ def _root(
     """Calibrate robot simulators with honest uncertainty."""
 
 
-def _say_early(line: str) -> None:
-    print(f"sipe: {line}", file=sys.stderr, flush=True)
-
-
 def calibrate(
     config: Annotated[Path, typer.Argument(help="TOML file: model, logs, parameters. See examples/.")],
     estimator: Annotated[
@@ -147,7 +144,7 @@ def calibrate(
         check_least(1, budget=budget, threads=threads)
         check_least(0, time_limit=time_limit)
         calibration = run(
-            config, estimator, seed, budget, out, threads, progress, device, None if as_json else _say_early, time_limit
+            config, estimator, seed, budget, out, threads, progress, device, None if as_json else say_early, time_limit
         )
     discovery = None
     if discover:

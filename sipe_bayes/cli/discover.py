@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sipe_bayes.cli.errors import INTERRUPTED, check_least, exit_on_error, say_interrupted
+from sipe_bayes.cli.errors import INTERRUPTED, check_least, exit_on_error, say_early, say_interrupted
 from sipe_bayes.inference.progress_bar import ProgressBar
 
 if TYPE_CHECKING:
@@ -47,12 +47,16 @@ def discover(
     """Physics that the model lacks: proposed, fitted, and compared by what it predicts of pieces that were held out."""
     from sipe_bayes.calibration.discover import run_discovery
     from sipe_bayes.core.files import to_json
+    from sipe_bayes.core.telling import silent
 
     with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json, counted=False) as progress:
         check_least(0, seed=seed, time_limit=time_limit)
         check_least(1, budget=budget, threads=threads)
         told = counted(progress)
-        discovery = run_discovery(config, out, seed, budget, only or None, without or (), threads, told, time_limit)
+        warn = silent if as_json else say_early
+        discovery = run_discovery(
+            config, out, seed, budget, only or None, without or (), threads, told, time_limit, warn
+        )
     if as_json:
         print(to_json(discovery.to_dict()))
     else:
@@ -91,8 +95,7 @@ def lines_of(discovery: Discovery) -> list[str]:
         with_error,
     )
 
-    of_columns = f" ({discovery.column_rollouts} for signs and units of columns)" if discovery.column_rollouts else ""
-    effort = f"{len(discovery.rows)} structures fitted, {discovery.rollouts} rollouts{of_columns}"
+    effort = f"{len(discovery.rows)} structures fitted, {discovery.rollouts} rollouts"
     lines = [f"{discovery.name}, what the model lacks: {singular(effort)}, {discovery.seconds:.0f} s"]
     tried = [f"{'log predictive density in nats over the model as it was':60}{'gain':>18}{'weight':>9}"]
     for one in discovery.rows:

@@ -142,3 +142,8 @@ def check_one_of(option: str, value: str, known: tuple[str, ...]) -> None:
 def command_line() -> str:
     """The command that is running, as a shell takes it."""
     return shlex.join(["sipe", *sys.argv[1:]])
+
+
+def say_early(line: str) -> None:
+    """Print a line on standard error while a command runs."""
+    print(f"sipe: {line}", file=sys.stderr, flush=True)

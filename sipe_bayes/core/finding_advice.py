@@ -95,10 +95,6 @@ ADVICE: dict[Code, str] = {
         "What was not fitted may be what the model lacks. Give a larger budget or more time, with which the same "
         "folder goes on, or fewer candidates by `--only` and `structure.sites`."
     ),
-    Code.COLUMNS_UNTRIED: (
-        "Much of a channel is unexplained, and not every column could be tried for it. Look at the signals in the "
-        "report: a wrong sign mirrors, a wrong unit scales. `sipe validate` asks the logs too."
-    ),
     Code.SEARCH_CUT_SHORT: "Raise `budget`. The message's estimate is a stage on the way.",
     Code.SEARCH_UNSETTLED: (
         "Often a ridge of parameters that act alike, or a rough simulation: fix one of the parameters of a ridge. With "

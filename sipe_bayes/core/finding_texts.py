@@ -131,10 +131,6 @@ class Code(Enum):
     STRUCTURES_CUT_SHORT = blocking(
         "the search ended {why} before {before}{untried}: {remedy}, and the same folder goes on"
     )
-    COLUMNS_UNTRIED = caution(
-        "{count} signs and units of columns were not tried, for which a share of the budget of {budget} rollouts was "
-        "not enough, the most promising that {example}: see that the columns are right, or give --budget {larger}"
-    )
 
     # laplace
     DIVERGES_AS_GIVEN = caution("the model as given diverges on these logs; the search started elsewhere")

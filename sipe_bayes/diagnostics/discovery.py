@@ -113,7 +113,6 @@ class Discovery:
 
     Args:
         name: of the run.
-        columns: of the logs that have a wrong sign or unit, in words; everything below is of the logs set right.
         rows: structures that were fitted, the set that the logs support first.
         pieces: extensions that were fitted, those of the structure that is written out first.
         promises: what extensions promised at the plain model, best first.
@@ -131,7 +130,6 @@ class Discovery:
         signals: of each log and channel; ``mode`` is the structure, ``default`` the plain model, calibrated.
         settled: whether every fit that counts came to rest, and the budget was enough.
         rollouts: of all fits.
-        column_rollouts: those of them that tried signs and units of columns.
         seconds: that it took.
         findings: what was noticed on the way.
         run: record of the run.
@@ -141,7 +139,6 @@ class Discovery:
     """
 
     name: str
-    columns: tuple[str, ...]
     rows: tuple[StructureRow, ...]
     pieces: tuple[Piece, ...]
     promises: tuple[Promise, ...]
@@ -158,7 +155,6 @@ class Discovery:
     signals: tuple[Signal, ...] = field(repr=False)
     settled: bool
     rollouts: int
-    column_rollouts: int
     seconds: float
     findings: tuple[Finding, ...] = ()
     run: Mapping[str, object] = field(default_factory=dict)
@@ -180,7 +176,6 @@ class Discovery:
         """As JSON has it, without signals and residuals."""
         return {
             "name": self.name,
-            "columns": list(self.columns),
             "structures": [asdict(row) for row in self.rows],
             "pieces": [asdict(piece) for piece in self.pieces],
             "promises": [asdict(promise) for promise in self.promises],
@@ -196,7 +191,6 @@ class Discovery:
             "findings": [item.to_dict() for item in self.findings],
             "warnings": Findings(self.findings).warnings,
             "rollouts": self.rollouts,
-            "column_rollouts": self.column_rollouts,
             "seconds": self.seconds,
             "out": self.out,
         }

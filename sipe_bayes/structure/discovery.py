@@ -113,7 +113,7 @@ def discover(
     given = simulator, trajectories, holdout, prior, likelihood, restriction, options, budget, seed, progress
     search = _search(*given)
     fingerprint = _fingerprint(search, simulator, restriction or Restriction())
-    search.given = search.fitting = replace(search.fitting, ends=began + time_limit)
+    search.fitting = replace(search.fitting, ends=began + time_limit)
     state = DiscoverState(budget=search.budget)
     if checkpoint is not None and checkpoint.exists():
         enough = search.enough([]) / search.options.plain_share

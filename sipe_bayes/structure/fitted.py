@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -21,7 +21,6 @@ from sipe_bayes.likelihood import BoundLikelihood, FitResult, Noise, QuadraticPr
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.columns import Column, corrected
 from sipe_bayes.structure.extension import Placed, extended
 from sipe_bayes.structure.internal_starts import mapped_starts
 from sipe_bayes.structure.scores import Pieces, Scores, predictive, scores
@@ -112,14 +111,6 @@ class Fitting:
     def simulator(self, placed: Sequence[Placed]) -> Simulator:
         """Of the model with extensions."""
         return Simulator(extended(self.environment, placed) if placed else self.environment, self.num_threads)
-
-    def corrected(self, columns: Sequence[Column]) -> Fitting:
-        """The same with columns of the logs multiplied."""
-        if not columns:
-            return self
-        logs, actuators = corrected(self.trajectories, columns, self.environment.actuators), self.environment.actuators
-        held = None if self.holdout is None else corrected(self.holdout, columns, actuators)
-        return replace(self, trajectories=logs, holdout=held)
 
     def windows(self, simulator: Simulator) -> BoundLikelihood:
         """The logs bound to a model."""

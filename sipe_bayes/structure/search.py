@@ -4,8 +4,6 @@ r"""The search over structures: what fits best is extended, round by round; then
 
     PLAIN   the model as it is; fitted again, and the search repeated, where an extension gains far more than predicted
       v
-    COLUMNS where much is left: signs and units of the logs' columns
-      v
     RANK    score tests of all extensions, beside each structure of the beam
       |  something has a predicted gain        nothing has
       v                                           v
@@ -35,7 +33,6 @@ from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood import BoundLikelihood, QuadraticPrior
 from sipe_bayes.structure.augmented import AugmentedModel, DivergesError
 from sipe_bayes.structure.candidates import Candidate, rank_candidates
-from sipe_bayes.structure.columns import Column, channels_of, choices, is_explained, log_jacobian, moving, unexplained
 from sipe_bayes.structure.comparison import choose_ties, difference, rank
 from sipe_bayes.structure.extension import Extension, Placed, members, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
@@ -65,7 +62,7 @@ class StructureSearch:
         budget: int = BUDGET,
         progress: Progress | None = None,
     ) -> None:
-        self.given = self.fitting = fitting
+        self.fitting = fitting
         self.extensions, self.joints = tuple(extensions), joints
         self.options, self.budget, self.progress = options or DiscoverOptions(), budget, progress
         self._rollouts, self._fit_rollouts, self._doing = 0, 0, ""  # before the present fit, of it, and what it is for
@@ -88,7 +85,6 @@ class StructureSearch:
             return replace(state, phase=Phase.DONE, cut=state.cut if state.done else state.phase)
         state = {
             Phase.PLAIN: self._plain,
-            Phase.COLUMNS: self._columns,
             Phase.RANK: self._rank,
             Phase.FIT: self._fit,
             Phase.PRUNE: self._prune,
@@ -170,7 +166,6 @@ class StructureSearch:
         """Place the extensions, once the plain model is fitted."""
         if self._placed or not state.fitted:
             return
-        self.fitting = self.given.corrected(state.columns)
         windows = self.fitting.windows(self.fitting.simulator([]))
         self._machine = machine_of(windows, *(state.placed_at or (state.fitted[0].theta, state.fitted[0].starts)))
         every = (p for e in self.extensions for p in placements(e, self._machine))
@@ -180,61 +175,11 @@ class StructureSearch:
         self._placed = {p.label: p for p in every if allowed is None or allowed.issuperset(members(p.site))}
 
     def _plain(self, state: DiscoverState) -> DiscoverState:
-        """The plain model, where it can be fitted at all."""
-        plain, _ = self._try([], min(self.enough([]), int(self.options.plain_share * self.budget)))
-        cut = Phase.PLAIN if plain is not None and self.is_late and not plain.settled else None
-        return replace(state, fitted=() if plain is None else (plain,), phase=Phase.COLUMNS, cut=cut)
-
-    def _columns(self, state: DiscoverState) -> DiscoverState:
-        """The column whose factor makes the plain model fit far better, if any does."""
-        given, plain, options = self.given, state.fitted[0] if state.fitted else None, self.options
-        state, share = replace(state, phase=Phase.RANK), dict.fromkeys(given.environment.channels, 0.0)
-        windows, channels = given.windows(given.simulator([])), channels_of(given.environment)
-        shown = moving(windows)
-        if plain is not None:
-            left = unexplained(windows, plain.sd, shown)
-            if max(left.values(), default=0.0) < options.gross:
-                return state
-            rests = set(np.array(windows.fitted)[~shown].tolist())
-            share = {name: left.get(name, 0.0) for name in share if name not in rests}
-        columns, tried, spent, number = choices(channels, share), [], 0, 0
-        # without a plain model there is nothing else to spend the budget on
-        most = self.budget if plain is None else options.column_share * (self.budget - plain.rollouts)
-        while number < len(columns) and spent + options.column_budget <= most and not self.is_late:
-            column, number = columns[number], number + 1
-            doing = replace(state, phase=Phase.COLUMNS).describe(0)
-            self._doing = f"{doing}, {number} of {len(columns)}"
-            one, rollouts = self._try([column], options.column_budget)
-            spent += rollouts
-            own = channels[column.name, column.command]
-            if one is not None and (not plain or is_explained(windows, one.sd, shown, column, own, options.gross)):
-                tried.append((one.evidence + log_jacobian(windows, column), column, one))
-        if plain is None and not tried:
-            plain = given.fit([], None, self.enough([]))  # or what keeps the plain model from being fitted is raised
-            return replace(state, fitted=(plain,), column_rollouts=spent)
-        if plain is not None and self.is_late and number < len(columns):  # the same search tries them again
-            return replace(state, column_rollouts=spent, cut=Phase.COLUMNS)
-        best = max(tried, key=lambda item: item[0], default=None)
-        if best is None or (plain is not None and best[0] < plain.evidence + options.column_gain):
-            return replace(state, column_rollouts=spent, untried=tuple(columns[number:]))
-        self._placed = {}
-        spent += (0 if plain is None else plain.rollouts) - best[2].rollouts
-        # evidences are in the corrected logs' units from here on
-        return replace(state, fitted=(best[2],), columns=(best[1],), column_rollouts=spent, placed_at=None)
-
-    def _try(self, columns: Sequence[Column], budget: int) -> tuple[FittedStructure | None, int]:
-        """The plain model fitted to logs with columns multiplied, None where it cannot be; and the rollouts.
-
-        Raises BudgetTooSmall for the logs as they are.
-        """
-        self._rollouts, self._fit_rollouts = self._rollouts + self._fit_rollouts, 0
-        try:
-            one = self.given.corrected(columns).fit([], None, max(budget, 1), self._tell)
-        except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
-            if not columns and isinstance(error, BudgetTooSmall):
-                raise
-            return None, self._fit_rollouts  # as far as it told
-        return one, one.rollouts
+        """The nominal model fitted."""
+        budget = min(self.enough([]), int(self.options.plain_share * self.budget))
+        plain = self.fitting.fit([], None, max(budget, 1), self._tell)
+        cut = Phase.PLAIN if self.is_late and not plain.settled else None
+        return replace(state, fitted=(plain,), phase=Phase.RANK, cut=cut)
 
     def _rank(self, state: DiscoverState) -> DiscoverState:
         """Predicted gains beside one structure of the beam; or which structures are to be fitted."""
@@ -310,15 +255,8 @@ class StructureSearch:
         if state.cut is not None or plain.evidence < before.evidence + self.options.least_gain:
             return state
         self._placed, spent = {}, sum(other.rollouts for other in state.fitted[1:])
-        anew = DiscoverState(Phase.RANK, (plain,), columns=state.columns, pruned=((),), budget=state.budget)
-        return replace(
-            anew,
-            column_rollouts=state.column_rollouts,
-            rank_rollouts=state.rank_rollouts,
-            failed_rollouts=state.failed_rollouts + spent,
-            untried=state.untried,
-            near=state.near,
-        )
+        anew = DiscoverState(Phase.RANK, (plain,), pruned=((),), budget=state.budget, near=state.near)
+        return replace(anew, rank_rollouts=state.rank_rollouts, failed_rollouts=state.failed_rollouts + spent)
 
     def _next_beam(self, state: DiscoverState) -> tuple[tuple[str, ...], ...]:
         """Labels of the best new structures that are clearly better than what they contain, and not clearly behind."""

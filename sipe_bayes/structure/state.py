@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
-from sipe_bayes.core.thresholds import THRESHOLDS
-from sipe_bayes.structure.columns import Column
 from sipe_bayes.structure.fitted import FittedStructure
 
 BUDGET = 30_000  # rollouts by default: structures with two pieces of a machine with two joints
@@ -23,10 +21,6 @@ class DiscoverOptions(Options):
     beam: int = option(2, "structures that each round extends", least=1)
     most: int = option(5, "extensions that a structure may have", least=1)
     least_gain: float = option(5.0, "predicted gain from which an extension is fitted", "nats", above=0)
-    gross: float = option(THRESHOLDS.gross, "of a channel's spread left from which signs and units are tried", least=0)
-    column_gain: float = option(50.0, "evidence that a sign or unit must gain", "nats", above=0)
-    column_share: float = option(0.2, "of the budget, for signs and units at most", above=0, below=1)
-    column_budget: int = option(400, "rollouts of one fit with another sign or unit", least=1)
     plain_share: float = option(0.5, "of the budget, for the model as it is at most", above=0, below=1)
     fit_budget: int = option(2000, "rollouts of one fit, or forty steps of it if that is more", least=1)
     physics_steps: int = option(
@@ -38,7 +32,6 @@ class Phase(enum.Enum):
     """What the next step does."""
 
     PLAIN = "plain"
-    COLUMNS = "columns"
     RANK = "rank"
     FIT = "fit"
     PRUNE = "prune"
@@ -77,14 +70,11 @@ class DiscoverState:
         queue: labels of the structures that this round still has to fit.
         pruned: labels of structures that were fitted from a larger one that ended elsewhere.
         failed: labels of structures that could not be fitted.
-        columns: of the logs that are multiplied, since then the plain model fits far better.
-        column_rollouts: of the trials of signs and units.
         rank_rollouts: of the rankings.
         failed_rollouts: of fits that failed, as far as they told.
-        untried: signs and units that their share of the budget did not reach.
         cut: what the search was doing when it was cut short; None while it is not.
         cut_off: labels of the structure whose fit was, which counts for nothing then; None where none was.
-        budget: rollouts at most, of which the plain fit and the trials of columns get a share.
+        budget: rollouts at most, of which the plain fit gets a share.
         placed_at: theta and initial states of the plain model, by whose motion extensions' parameters have bounds.
         near: whether a structure has fitted worse than a part of it; then fits begin at the optimum of a part.
     """
@@ -97,11 +87,8 @@ class DiscoverState:
     queue: tuple[tuple[str, ...], ...] = ()
     pruned: tuple[tuple[str, ...], ...] = ()
     failed: tuple[tuple[str, ...], ...] = ()
-    columns: tuple[Column, ...] = ()
-    column_rollouts: int = 0
     rank_rollouts: int = 0
     failed_rollouts: int = 0
-    untried: tuple[Column, ...] = ()
     cut: Phase | None = None
     cut_off: tuple[str, ...] | None = None
     budget: int = 0
@@ -109,15 +96,14 @@ class DiscoverState:
     near: bool = False
 
     def with_budget(self, budget: int, plain_fit: float) -> DiscoverState:
-        """It with another budget; from the beginning where a larger one would have fitted or tried more at first.
+        """It with another budget; from the beginning where a larger one would have fitted the plain model further.
 
         Args:
             budget: rollouts at most, of all.
             plain_fit: budget from which the plain fit has all that a fit may have.
         """
         short = self.budget < plain_fit and not (self.fitted and self.fitted[0].settled)
-        anew = budget > self.budget and (short or bool(self.untried))
-        return DiscoverState(budget=budget) if anew else replace(self, budget=budget)
+        return DiscoverState(budget=budget) if budget > self.budget and short else replace(self, budget=budget)
 
     def describe(self, extensions: int) -> str:
         """What comes next, for the progress bar; of so many extensions."""
@@ -125,7 +111,6 @@ class DiscoverState:
         beside = f" beside {' and '.join(at)}" if at else ""
         return {
             Phase.PLAIN: "fitting the model as it is",
-            Phase.COLUMNS: "trying signs and units of the logs' columns",
             Phase.RANK: f"testing {extensions} extensions{beside}",
             Phase.FIT: f"fitting {' and '.join(self.queue[0]) if self.queue else ''}",
             Phase.PRUNE: "leaving out each extension once",
@@ -139,9 +124,8 @@ class DiscoverState:
 
     @property
     def rollouts(self) -> int:
-        """Of all fits, those that failed or had other signs and units too, and of rankings."""
-        beside = self.column_rollouts + self.rank_rollouts + self.failed_rollouts
-        return sum(one.rollouts for one in self.fitted) + beside
+        """Of all fits, those that failed too, and of rankings."""
+        return sum(one.rollouts for one in self.fitted) + self.rank_rollouts + self.failed_rollouts
 
     def of(self, labels: Sequence[str]) -> FittedStructure | None:
         """The fit of a structure, whatever the order of its extensions."""

@@ -12,7 +12,6 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior import GaussianMixture
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.columns import Column
 from sipe_bayes.structure.comparison import difference, stack
 from sipe_bayes.structure.extension import Placed
 from sipe_bayes.structure.fitted import FittedStructure
@@ -67,11 +66,6 @@ class Structures:
     def fitted(self) -> tuple[FittedStructure, ...]:
         """All of them."""
         return self.state.fitted
-
-    @property
-    def columns(self) -> tuple[Column, ...]:
-        """Of the logs that were multiplied, since then the plain model fits far better; all fits are to these logs."""
-        return self.state.columns
 
     @property
     def rollouts(self) -> int:

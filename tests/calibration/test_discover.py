@@ -5,14 +5,12 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import math
 import tomllib
 from functools import partial
 from pathlib import Path
 
 import mujoco
 import numpy as np
-import pandas as pd
 import pytest
 
 import sipe_bayes as sipe
@@ -176,25 +174,14 @@ def test_shorter_steps_are_written_into_the_model(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("unreported")
-@pytest.mark.parametrize(
-    ("column", "factor", "key"), [("torque", -1.0, "sign"), ("angle", 180 / math.pi, "factor")], ids=["sign", "unit"]
-)
-def test_wrong_column_is_said_and_set_right_in_the_configuration(
-    column: str, factor: float, key: str, tmp_path: Path
-) -> None:
-    config = write_lacking(tmp_path, structure='[structure]\nonly = ["dry_friction"]\n', factors={column: factor})
-    content = config.read_text().replace("window = 1.0", 'window = "log"')
-    config.write_text(content.replace("span = [0.0, 5.0]", "span = [0.0, 2.5]").replace("5.01, 8.0", "2.51, 4.0"))
-    found = run_discovery(config, tmp_path / "out", num_threads=1)
-    (sentence,) = found.columns
-    assert sentence in discovery_verdicts(found)[0].text
-    assert sentence in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert [piece.label for piece in found.kept] == ["dry_friction:hinge"]
-    data = tomllib.loads((tmp_path / "out" / "discovered.toml").read_text(encoding="utf-8"))
-    rows = [r for r in (*data["commands"], *data["measurements"]) if key in r]  # a torque and an angle turn together
-    assert [row[key] for row in rows] == [pytest.approx(1 / factor)]
-    again = run(tmp_path / "out" / "discovered.toml", out=tmp_path / "again", num_threads=1)
-    assert {p.name: p.mode for p in again.parameters} == pytest.approx(dict(found.best), rel=1e-3)
+def test_a_wrong_sign_is_named_before_the_search(tmp_path: Path) -> None:
+    table = '[structure]\nonly = ["dry_friction"]\nbudget = 1500\n'
+    config = write_lacking(tmp_path, structure=table, factors={"torque": -1.0})
+    warnings = list[str]()
+    found = run_discovery(config, tmp_path / "out", num_threads=1, warn=warnings.append)
+    (item,) = [item for item in found.findings if item.code is Code.COLUMN_NOT_FOLLOWED]
+    assert warnings == [item.text]
+    assert "angle" in item.text
 
 
 def test_start_of_an_unknown_parameter_is_one_line(tmp_path: Path) -> None:
@@ -320,16 +307,3 @@ def test_a_budget_that_ends_too_soon_is_said_and_what_to_give(tmp_path: Path) ->
     assert onward.settled
     assert [one.label for one in onward.kept] == ["dry_friction:hinge"]
     assert [one.gain for one in onward.kept] == pytest.approx([one.gain for one in at_once.kept], rel=1e-2)
-
-
-def test_columns_that_were_not_tried_are_said(tmp_path: Path) -> None:
-    config = write_lacking(tmp_path, structure='[structure]\nonly = ["dry_friction"]\nbudget = 1500\n')
-    config.write_text(config.read_text().replace("window = 1.0", 'window = "log"'))
-    table = pd.read_csv(tmp_path / "log.csv")
-    table["angle"] = 0.5 * np.sin(7 * table["time"])  # of no sign or unit
-    table.to_csv(tmp_path / "log.csv", index=False)
-    spent = run_discovery(config, tmp_path / "out", num_threads=1)
-    untried = [item for item in spent.findings if item.code is Code.COLUMNS_UNTRIED]
-    assert len(untried) == 1
-    assert "signs and units of columns were not tried" in untried[0].text
-    assert spent.column_rollouts <= 300

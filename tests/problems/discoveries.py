@@ -59,7 +59,6 @@ def make_discovery(*pieces: Piece, rows: int = 2, tied: tuple[StructureRow, ...]
     noise = {"angle": ChannelNoise(0.01, 0.1, "rad")}
     return Discovery(
         name="pendulum",
-        columns=(),
         rows=(row("dry friction at hinge", weight=0.6 if tied else 1.0), *tied, *[row() for _ in range(rows - 1)]),
         pieces=pieces,
         promises=(
@@ -79,7 +78,6 @@ def make_discovery(*pieces: Piece, rows: int = 2, tied: tuple[StructureRow, ...]
         signals=tuple(signal(log, log, "angle") for log in ("holdout", "train")),
         settled=True,
         rollouts=1234,
-        column_rollouts=0,
         seconds=5.6,
         out="runs/pendulum-discover",
     )

@@ -55,11 +55,6 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
     "found, wrong": (changed(FRICTION, **left(LARGE)), "fair", "The logs support friction at hinge"),
     "nothing": (make_discovery(), "good", "Nothing is lacking that these logs would show."),
     "nothing, wrong": (changed(**left(LARGE)), "bad", "nothing that was tried is what the model lacks"),
-    "a column": (
-        changed(columns=("the command of motor has the opposite sign: multiply it by -1",)),
-        "bad",
-        "do not say what the configuration says: the command of motor has the opposite sign: multiply it by -1.",
-    ),
     "better": (
         make_discovery(FRICTION),
         "good",
@@ -126,7 +121,6 @@ def test_what_is_clearly_behind_is_no_tie() -> None:
 
 NEXT = {
     "found": (make_discovery(FRICTION), "sipe calibrate runs/pendulum-discover/discovered.toml"),
-    "a column": (changed(columns=("a",)), "sipe calibrate runs/pendulum-discover/discovered.toml"),
     "nothing": (make_discovery(), "go on with the configuration"),
     "nothing, wrong": (changed(**left(LARGE)), "structure.extra"),
     "nothing tried": (changed(**left(LARGE), findings=(CUT,)), "with a larger budget"),
@@ -147,7 +141,6 @@ def test_twenty_lines_hold_whatever_there_is_to_say(capsys: pytest.CaptureFixtur
     full = make_discovery(FRICTION, LAW, GAINS, rows=12, tied=(TWIN,) * 9)
     full = dataclasses.replace(
         full,
-        columns=("a", "b"),
         errors=full.errors * 5,
         parameters=full.parameters * 4,
         findings=tuple(Finding(Code.NOT_EXPORTED, Severity.CAUTION, f"{k}") for k in range(5)),
@@ -164,7 +157,7 @@ def test_twenty_lines_hold_whatever_there_is_to_say(capsys: pytest.CaptureFixtur
 def test_page_says_it_all_and_escapes_names() -> None:
     measured = piece("delay", "angle", kept=True, kind="channel", native=False)
     made = make_discovery(FRICTION, LAW, measured, tied=(TWIN,))
-    discovery = dataclasses.replace(made, name=EVIL, columns=(EVIL,))
+    discovery = dataclasses.replace(made, name=EVIL)
     images = discovery_pictures(discovery)
     assert {image.section for image in images} == {"signals_holdout", "signals_train", "residuals", "values"}
     html = render_discovery(discovery, images)

@@ -1,4 +1,4 @@
-"""The search over structures: what is planted is named, a right model is left as it is, wrong columns are found.
+"""The search over structures: what is planted is named, a right model is left as it is.
 
 One log each at fixed seeds; rates over many are measured by examples/studies/discover.py.
 """
@@ -16,9 +16,7 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.likelihood import Segments
-from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.structure import DiscoverOptions, Extension, Restriction, Structures, discover
-from sipe_bayes.structure.columns import Column, channels_of, choices, log_jacobian, moving, unexplained
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.machine import Machine
 from sipe_bayes.structure.scores import Pieces
@@ -150,21 +148,6 @@ def test_what_the_same_motion_has_is_not_decided() -> None:
     assert {one.labels for one in twin.supported} == {("offset:motor",), ("bias:motor",)}
 
 
-@pytest.mark.parametrize(("factor", "command", "words"), [(-1.0, False, "opposite sign"), (1000.0, True, "thousand")])
-def test_a_wrong_column_is_found_before_any_physics_is_blamed(factor: float, command: bool, words: str) -> None:
-    recorded = log(pendulum(), [0.6, 0.08], 4)
-    channels = tuple(pendulum().environment.channels)
-    wrong = replace(recorded, actions=recorded.actions * factor, channels=channels)
-    if not command:
-        wrong = replace(recorded, observations=recorded.observations * factor, channels=channels)
-    structures = searched(wrong, names=("dry_friction",))
-    (column,) = structures.state.columns
-    print(column.sentence, structures.table())
-    assert column.factor == pytest.approx(1 / factor)
-    assert words in column.sentence
-    assert structures.best.labels == ()
-
-
 class Bias(Extension):
     """The same constant force as an offset's, by another number."""
 
@@ -178,58 +161,6 @@ class Bias(Extension):
         """As wide as the offset's."""
         size = machine.commands[site]
         return (Parameter(f"{site}.bias", -size, size, targets=(f"actuator:{site}.bias_force",)),)
-
-
-def test_what_rests_has_neither_sign_nor_unit() -> None:
-    """A channel of noise alone is left unexplained by every model, and no reason to try columns."""
-    simulator, moves = pendulum(), log(pendulum(), [0.6, 0.08], 4)
-    noise = np.random.default_rng(0).standard_normal(moves.observations.shape)
-    rests = replace(moves, observations=0.01 * noise)
-    rough = replace(moves, observations=moves.observations + 0.7 * moves.observations.std() * noise)
-    for trajectory, expected in ((moves, True), (rests, False), (rough, True)):
-        windows = Windows(Segments(0.5), simulator, Trajectories.stack([trajectory]))
-        assert moving(windows).tolist() == [expected] * len(windows.channels)
-        left = unexplained(windows, windows.spread, moving(windows))
-        assert left == (dict.fromkeys(windows.fitted, 1.0) if expected else {})
-
-
-def test_columns_that_are_tried_in_vain_count() -> None:
-    """A log of which no unit or sign explains enough: rollouts go on from what the trials took."""
-    moves, done = log(pendulum(), [0.6, 0.08], 4), list[int]()
-    noise = 0.5 * np.sin(7 * moves.dt * np.arange(len(moves.observations)))[:, None]
-    structures = discover(
-        pendulum(),
-        Trajectories.stack([replace(moves, observations=noise)]),
-        restriction=Restriction(only=("delay",)),
-        options=DiscoverOptions(column_gain=1e9),
-        progress=lambda _, rollouts, __: done.append(rollouts),
-    )
-    assert not structures.state.columns
-    assert done == sorted(done)
-    assert structures.rollouts >= done[-1] > 500
-    assert structures.state.column_rollouts > 500 > structures.plain.rollouts
-    of_fits = sum(one.rollouts for one in structures.fitted)
-    assert structures.rollouts == of_fits + structures.state.column_rollouts + structures.state.rank_rollouts
-
-
-def test_signs_and_units_leave_the_budget_to_physics() -> None:
-    """What is not tried for it is named, and the pieces are ranked all the same."""
-    moves = log(pendulum(), [0.6, 0.08], 4)
-    noise = 0.5 * np.sin(7 * moves.dt * np.arange(len(moves.observations)))[:, None]
-    structures = discover(
-        pendulum(),
-        Trajectories.stack([replace(moves, observations=noise)]),
-        restriction=Restriction(only=("delay",)),
-        options=DiscoverOptions(column_gain=1e9, column_budget=150),
-        budget=1000,
-    )
-    assert structures.offers()
-    assert structures.settled
-    assert 0 < structures.state.column_rollouts <= 0.2 * 1000
-    tried = 10 - len(structures.state.untried)
-    assert 1 <= tried < 10
-    machine = structures.search.given.environment
-    assert list(structures.state.untried) == choices(channels_of(machine), dict.fromkeys(machine.channels, 1.0))[tried:]
 
 
 def test_a_budget_is_a_bound_and_where_it_ends_the_search_is_not_settled() -> None:
@@ -286,36 +217,8 @@ def test_a_long_log_is_searched_on_blocks_of_it() -> None:
     assert structures.best.labels == ("dry_friction:hinge",)
 
 
-def test_a_unit_is_judged_by_the_samples_that_are_fitted_alone() -> None:
-    """The fit leaves most of a long log out, and the plain model follows nothing: no unit is to blame for that."""
-    gravity = Parameter("spring", 0.0, 30.0, targets=("joint:hinge.stiffness",))
-    recorded = log(pendulum(gravity), [0.6, 0.02, 8.0], 8, steps=2000)
-    structures = discover(
-        pendulum(),
-        Trajectories.stack([recorded]),
-        restriction=Restriction(only=("dry_friction",)),
-        options=DiscoverOptions(physics_steps=500),
-    )
-    windows = structures.search.given.windows(structures.search.given.simulator([]))
-    (name,) = windows.fitted
-    assert max(unexplained(windows, structures.plain.sd, moving(windows)).values()) > structures.search.options.gross
-    assert structures.columns == ()
-    few = log_jacobian(windows, Column(name, False, 1000.0)) / np.log(1000.0)
-    assert few == pytest.approx(500, rel=0.2)
-    assert log_jacobian(windows, Column("motor", True, 1000.0)) == 0.0
-
-
-def test_noise_does_not_keep_a_sign_from_being_set_right() -> None:
-    """A third of the channel's spread is noise, which no sign explains."""
-    recorded = log(pendulum(), [0.6, 0.08], 4, sd=0.0)
-    size = 0.35 * recorded.observations.std()
-    noise = size * np.random.default_rng(1).standard_normal(recorded.observations.shape)
-    turned = replace(recorded, observations=-(recorded.observations + noise))
-    assert [column.factor for column in searched(turned, names=("spring",)).columns] == [-1.0]
-
-
 def test_a_larger_budget_begins_anew_where_the_smaller_one_told_the_beginning_short() -> None:
-    """A plain fit that had not come to rest in its share, or columns that were not tried; else it goes on."""
+    """A plain fit that had not come to rest in its share; else it goes on."""
     plain = FittedStructure(
         (), np.zeros(1), np.zeros(1), np.eye(1), np.zeros(0), np.zeros(0), np.zeros(0), 0.0, NO_PIECES, 7, settled=True
     )
@@ -325,5 +228,3 @@ def test_a_larger_budget_begins_anew_where_the_smaller_one_told_the_beginning_sh
     assert unsettled.with_budget(200, 150) == DiscoverState(budget=200)
     assert unsettled.with_budget(200, 80).fitted == unsettled.fitted  # it had all that a fit may have
     assert unsettled.with_budget(100, 150).fitted == unsettled.fitted  # an interruption, not a larger budget
-    untried = replace(state, untried=(Column("angle", False, -1.0),))
-    assert untried.with_budget(200, 150) == DiscoverState(budget=200)

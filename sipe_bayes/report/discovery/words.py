@@ -60,14 +60,6 @@ def alternative_text(row: StructureRow) -> str:
     return f"{structure_text(row)} (difference {with_error(-row.behind, row.behind_error)} nats)"
 
 
-def column_verdict(discovery: Discovery) -> Verdict | None:
-    """Which columns of the logs have a wrong sign or unit."""
-    if not discovery.columns:
-        return None
-    what = f"The logs do not say what the configuration says: {listed(discovery.columns)}."
-    return Verdict("bad", f"{what} discovered.toml has it right, and everything below is of logs set right.")
-
-
 def headline(discovery: Discovery) -> Verdict:
     """What the model lacks, and how much of it."""
     kept = "; and ".join(", ".join(filter(None, [p.sentence, found_values(discovery, p)])) for p in discovery.kept)
@@ -164,14 +156,14 @@ def trust(discovery: Discovery) -> Verdict:
 
 def discovery_verdicts(discovery: Discovery) -> list[Verdict]:
     """The answer: at the top of the report, and at the end of what is printed."""
-    out = [column_verdict(discovery), headline(discovery), held_out_verdict(discovery), ties(discovery)]
+    out = [headline(discovery), held_out_verdict(discovery), ties(discovery)]
     return [verdict for verdict in (*out, remains(discovery), trust(discovery)) if verdict is not None]
 
 
 def next_steps(discovery: Discovery) -> str:
     """What to do with it."""
     out = Path(discovery.out)
-    if discovery.kept or discovery.columns:
+    if discovery.kept:
         alone = "; its intervals hold for this structure alone, those above for all of the set"
         onward = f"sipe calibrate {out / 'discovered.toml'} (the model with these values: {out / 'discovered.xml'})"
         return onward + alone * bool(alternatives(discovery))
