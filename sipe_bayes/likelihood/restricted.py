@@ -43,7 +43,11 @@ class Pulls:
 
 
 def eliminate_starts(
-    normal: FloatArray, num_theta: int, start_precision: FloatArray, start_pull: FloatArray, damping: float = 0.0
+    normal: FloatArray,
+    num_theta: int,
+    start_precision: FloatArray,
+    start_pull: FloatArray,
+    damping: float | FloatArray = 0.0,
 ) -> Eliminated:
     """Normal equations of theta with the windows' starts marginalised.
 
@@ -52,7 +56,7 @@ def eliminate_starts(
         num_theta: N.
         start_precision: (D,) of the starts' weak prior.
         start_pull: its negative gradient (W, D).
-        damping: Levenberg and Marquardt's, relative, of the starts' block.
+        damping: Levenberg and Marquardt's, relative, of the starts' block; of each window's (W, 1).
 
     Raises:
         numpy.linalg.LinAlgError: where the starts' block is not positive definite.

@@ -463,14 +463,9 @@ class Windows:
             residual, valid = self.residuals(theta[None], starts[None])
             return residual[0], bool(valid[0])
 
-        def energies(starts: FloatArray, residual: FloatArray) -> FloatArray:
-            rows = zip(self.whitened(residual[None], noise), self.sequences, strict=True)
-            squares = [np.bincount(s.window, r[0] ** 2, minlength=len(starts)) for r, s in rows]
-            return np.asarray(sum(squares)) + starts**2 @ self.start_precision
-
         starts = self.no_starts()
         residual, valid = simulated(starts)
-        energy = energies(starts, residual)
+        energy = self.energies(starts[None], residual[None], noise)[0]
         for _ in range(_ITERATIONS if valid and np.isfinite(residual).all() else 0):
             linearisation = self.linearise(theta, starts, with_theta=False, residual=residual)
             move = self.log_density(self.moments(linearisation), noise, starts)[1]
@@ -478,14 +473,15 @@ class Windows:
             for share in _SHORTER:
                 tried = np.where(rest[:, None], starts + share * move, starts)
                 left, good = simulated(tried)
-                after = energies(tried, left) if good else np.full(len(starts), np.inf)
+                after = self.energies(tried[None], left[None], noise)[0] if good else np.full(len(starts), np.inf)
                 better = rest & (after < energy)
                 starts = np.where(better[:, None], tried, starts)
                 residual, energy = np.where(better[:, None, None], left, residual), np.where(better, after, energy)
                 rest &= ~better
                 if not rest.any():
                     break
-            energy = energies(starts, residual)  # a window's first sample is whitened by the last one before it
+            # a window's first sample is whitened by the last one before it
+            energy = self.energies(starts[None], residual[None], noise)[0]
             if not energy.sum() < (1 - _SETTLED) * before:
                 break
         return starts, residual, valid
@@ -569,6 +565,14 @@ class Windows:
     def chi_square(self, residual: FloatArray, noise: Noise) -> FloatArray:
         """Whitened sum of squares (B,) of residuals (B, W, L, C)."""
         return np.asarray(sum((p**2).sum(-1) for p in self.whitened(residual, noise)))
+
+    def energies(self, starts: FloatArray, residual: FloatArray, noise: Noise) -> FloatArray:
+        """Of each window (B, W) the whitened squares of its residual (B, W, L, C) and of its start (B, W, D)."""
+        squares = starts**2 @ self.start_precision
+        for rows, s in zip(self.whitened(residual, noise), self.sequences, strict=True):
+            for own, row in zip(squares, rows, strict=True):
+                own += np.bincount(s.window, row**2, minlength=len(own))
+        return np.asarray(squares)
 
     def whitened(self, residual: FloatArray, noise: Noise) -> list[FloatArray]:
         """Of each channel the whitened rows (B, n) of residuals (B, W, L, C), in the order of ``sequences``."""

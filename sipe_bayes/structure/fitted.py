@@ -47,7 +47,6 @@ class FittedStructure:
         held: pieces that were held out.
         rollouts: that the fit took.
         settled: whether the search had come to rest.
-        behind: whether its first fit ended behind a part of it.
     """
 
     labels: tuple[str, ...]
@@ -61,7 +60,6 @@ class FittedStructure:
     held: Pieces
     rollouts: int
     settled: bool
-    behind: bool = False
 
     @property
     def spanned(self) -> FloatArray:
@@ -126,8 +124,8 @@ class Fitting:
         initial: FloatArray | None,
         budget: int,
         progress: Progress | None = None,
+        begin: FittedStructure | None = None,
         part: FittedStructure | None = None,
-        near: bool = False,
     ) -> FittedStructure:
         """The best optimum of a structure, and its scores.
 
@@ -138,8 +136,8 @@ class Fitting:
             initial: (N + P,), where the search begins; default as ``laplace`` does.
             budget: rollouts at most.
             progress: called along the way.
+            begin: the structure whose initial states the search begins with; default the measured ones.
             part: a structure with some of these extensions; none by default.
-            near: whether the fit from the part's optimum comes first, and the other one only if that ends behind.
 
         Raises:
             BudgetTooSmall: where it ends before there is an optimum.
@@ -148,12 +146,11 @@ class Fitting:
         prior = self.prior_of(simulator)
         windows = self.windows(simulator)
         left = max(budget - self._scoring(windows), 1)
-        begins: list[tuple[FloatArray | None, FloatArray | None]] = [(initial, None)]
-        if part is not None:
-            begins.insert(1 - near, self._part_optimum(placed, simulator, part))
-        rollouts, behind, found = 0, False, list[tuple[Scores, FitResult]]()
-        for number, begin in enumerate(begins):
-            laplace = self._laplace(simulator, prior, begin, left - rollouts, progress)
+        begins = [(initial, None if begin is None else self._starts_of(begin, simulator, placed))]
+        begins += [] if part is None else [self._part_optimum(placed, simulator, part)]
+        rollouts, found = 0, list[tuple[Scores, FitResult]]()
+        for number, at in enumerate(begins):
+            laplace = self._laplace(simulator, prior, at, left - rollouts, progress)
             try:
                 laplace.fit(self.trajectories)
                 assert laplace.result is not None
@@ -163,7 +160,6 @@ class Fitting:
                     raise
             rollouts += laplace.rollouts
             ahead = part is None or (found and found[-1][0].evidence >= part.evidence - _UNNEEDED)
-            behind |= number == 0 and not ahead
             if ahead or (found and (left < 2 * rollouts or time.monotonic() > self.ends)):
                 break
         (evidence, pieces), best = max(found, key=lambda one: (one[1].finding is None, one[0].evidence))
@@ -189,7 +185,6 @@ class Fitting:
             pieces,
             rollouts + windows.rollouts,
             best.finding is None,
-            behind,
         )
 
     @staticmethod
@@ -205,7 +200,7 @@ class Fitting:
 
     def _part_optimum(
         self, placed: Sequence[Placed], simulator: Simulator, part: FittedStructure
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, FloatArray | None]:
         """Theta (N + P,) and starts (W, D) of a structure where a part of it ended: further extensions do nothing."""
         by_label = {one.label: one for one in placed}
         extensions = [by_label[label] for label in part.labels]
@@ -214,8 +209,16 @@ class Fitting:
         for one in extensions:
             theta[one.label] = part.theta[first : first + len(one.parameters)]
             first += len(one.parameters)
-        starts = mapped_starts(self.simulator(extensions).model, simulator.model, part.starts)
+        starts = self._starts_of(part, simulator, placed)
         return np.concatenate([theta[""], *(theta.get(one.label, one.plain) for one in placed)]), starts
+
+    def _starts_of(self, one: FittedStructure, simulator: Simulator, placed: Sequence[Placed]) -> FloatArray | None:
+        """Starts (W, D) where a structure ended, as those of another one; None of one with states that this lacks."""
+        by_label = {other.label: other for other in placed}
+        if not set(one.labels) <= set(by_label):
+            same = one.starts.shape[-1] == self.windows(simulator).num_start
+            return one.starts if same else None
+        return mapped_starts(self.simulator([by_label[x] for x in one.labels]).model, simulator.model, one.starts)
 
     def _laplace(
         self,

@@ -231,7 +231,7 @@ class StructureSearch:
     def _fit(self, state: DiscoverState) -> DiscoverState:
         labels, *rest = state.queue
         offer = next(o for o in reversed(state.offers) if (*o.at, o.label) == labels)
-        state = self._fitted(state, labels, np.concatenate([offer.others, offer.theta]))
+        state = self._fitted(state, labels, np.concatenate([offer.others, offer.theta]), state.of(offer.at))
         if state.cut is not None:
             return state
         state = replace(state, queue=tuple(rest))
@@ -255,7 +255,7 @@ class StructureSearch:
         if state.cut is not None or plain.evidence < before.evidence + self.options.least_gain:
             return state
         self._placed, spent = {}, sum(other.rollouts for other in state.fitted[1:])
-        anew = DiscoverState(Phase.RANK, (plain,), pruned=((),), budget=state.budget, near=state.near)
+        anew = DiscoverState(Phase.RANK, (plain,), pruned=((),), budget=state.budget)
         return replace(anew, rank_rollouts=state.rank_rollouts, failed_rollouts=state.failed_rollouts + spent)
 
     def _next_beam(self, state: DiscoverState) -> tuple[tuple[str, ...], ...]:
@@ -282,7 +282,7 @@ class StructureSearch:
         """With a structure that has only those ``labels`` of another one, fitted from where that one ended."""
         keep = [i for i, label in enumerate(self._owners(one)) if label in (None, *labels)]
         before, failed = state.of(labels), state.failed
-        state = self._fitted(state, labels, one.theta[keep])
+        state = self._fitted(state, labels, one.theta[keep], one)
         if before is not None:  # a failure says nothing then
             state = replace(state, fitted=_merged(state.fitted, before), failed=failed, cut_off=None)
         return replace(state, pruned=(*state.pruned, labels))
@@ -293,7 +293,9 @@ class StructureSearch:
         own: list[str | None] = [None] * count
         return own + [label for label in one.labels for _ in self._placed[label].parameters]
 
-    def _fitted(self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray) -> DiscoverState:
+    def _fitted(
+        self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray, begin: FittedStructure | None
+    ) -> DiscoverState:
         left, cut = max(self.budget - state.rollouts, 0), None
         self._rollouts, self._fit_rollouts = state.rollouts, 0
         parts = [other for other in state.fitted if set(other.labels) < set(labels)]
@@ -302,8 +304,8 @@ class StructureSearch:
             most = self.enough(labels)
             cut = state.phase if left < most else None
             budget = max(min(most, left), 1)
-            one = self.fitting.fit(self.structure(labels), initial, budget, self._tell, part, state.near)
-            cut, state = state.phase if self.is_late else cut, replace(state, near=state.near or one.behind)
+            one = self.fitting.fit(self.structure(labels), initial, budget, self._tell, begin, part)
+            cut = state.phase if self.is_late else cut
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
             spent = state.failed_rollouts + self._fit_rollouts
             cut = cut if isinstance(error, BudgetTooSmall) else None

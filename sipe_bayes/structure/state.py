@@ -76,7 +76,6 @@ class DiscoverState:
         cut_off: labels of the structure whose fit was, which counts for nothing then; None where none was.
         budget: rollouts at most, of which the plain fit gets a share.
         placed_at: theta and initial states of the plain model, by whose motion extensions' parameters have bounds.
-        near: whether a structure has fitted worse than a part of it; then fits begin at the optimum of a part.
     """
 
     phase: Phase = Phase.PLAIN
@@ -93,7 +92,6 @@ class DiscoverState:
     cut_off: tuple[str, ...] | None = None
     budget: int = 0
     placed_at: tuple[FloatArray, FloatArray] | None = None
-    near: bool = False
 
     def with_budget(self, budget: int, plain_fit: float) -> DiscoverState:
         """It with another budget; from the beginning where a larger one would have fitted the plain model further.

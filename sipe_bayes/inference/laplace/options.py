@@ -22,7 +22,6 @@ class SolverTuning(Options):
     most_points: ClassVar[int] = 6  # with those found on the way
     growth: ClassVar[float] = 1.5  # by which beginnings of segments that meet impacts grow
     least_samples: ClassVar[float] = 200.0  # for each parameter, of the first part of the segments
-    corrections: ClassVar[int] = 6  # further steps at most by a linearisation of which a step gains too little
     explained: ClassVar[float] = 0.1  # share of squares left by initial states that explain the rest: plain fits miss
     silent: ClassVar[float] = 0.02  # share of squares left by fitted initial states below which plain fits tell nothing
     poor: ClassVar[float] = 3.0  # residuals over the samples' scatter from which more starting points are tried

@@ -85,6 +85,7 @@ from sipe_bayes.likelihood.wild_samples import wild_residuals
 from sipe_bayes.likelihood.windows import Linearisation, Windows, inward
 
 _DAMPINGS = np.array([0.03, 1.0, 30.0, 1000.0])  # tried together, times the damping of the step before
+_SHARES = np.array([1.0, 0.3, 0.0])  # of a change of initial states that are tried together, segment by segment
 _DIFFERENCE = 0.3  # conditional posterior sds that a finite difference is long
 _THROUGH_IMPACTS = 100  # draws from the prior, of which the best are followed where simulations jump
 _SCOUTED_STEPS = 16  # after which the next of them is followed: most fits that settle do so by then
@@ -117,6 +118,7 @@ class Here:
     starts_jacobian: FloatArray | None = None  # (K, L, C, D), kept; None where it is to be taken anew
     exact: bool = False  # whether the step before gained what was expected, so that its kept columns still hold
     gained: float = np.inf  # nats, by the step before
+    held: FloatArray = field(default_factory=lambda: np.zeros(0))  # (W,), further damping of each initial state
     enough: float = 0.0  # nats that plain least squares may leave; 0: as their residual tells
     white: bool = False  # whether the noise is white, as the configuration or the comparison asks
 
@@ -146,7 +148,7 @@ class _Trial(NamedTuple):
     """The best of a few damped steps, to theta (N,) and starts (K, D), and the residual (K, L, C) there.
 
     gained: nats, not above zero where no step lowered the energy; expected: of the least damped step, by the
-    linearisation; straight: nats gained without corrections; damping: of the best.
+    linearisation; damping: of the best; held: (K,) further damping of the next steps of each segment's initial state.
     """
 
     theta: FloatArray
@@ -154,8 +156,8 @@ class _Trial(NamedTuple):
     residual: FloatArray
     gained: float
     expected: float
-    straight: float
     damping: float
+    held: FloatArray
 
 
 class _Point(NamedTuple):
@@ -209,7 +211,7 @@ class SegmentSolver:
 
     @property
     def step_rollouts(self) -> int:
-        """Rollouts that a step takes at most, without corrections, which are left out where the budget ends."""
+        """Rollouts that a step takes at most."""
         windows = self.windows
         return (windows.num_theta + windows.num_start + len(_DAMPINGS) + 1) * len(windows.trajectories)
 
@@ -262,7 +264,8 @@ class SegmentSolver:
         stage = Stage.PLAIN if self._may_begin_plain else Stage.FIT
         noise = Noise(sd, np.zeros(len(sd)))
         white = windows.settings.noise != "ar1"
-        return Here(stage, 0, theta, windows.no_starts(), noise, self.tuning.damping, white=white)
+        held = np.zeros(windows.num_windows)
+        return Here(stage, 0, theta, windows.no_starts(), noise, self.tuning.damping, held=held, white=white)
 
     def usual_rest(self, state: SolverState) -> float:
         """Rollouts that a fit still takes as a rule, by the steps that real arms and servos took of each stage."""
@@ -460,7 +463,9 @@ class SegmentSolver:
             return self._profile(view, residual) + self.prior.energy(theta)
 
         enough = self._plain_enough(view, here, lin.residual)
-        best, residuals, values = best_step(view, thetas, view.no_starts(len(thetas)), energy_of, energy, enough)
+        no_starts = view.no_starts(len(thetas))
+        residuals, valid = view.residuals(thetas, no_starts)
+        best, values = best_step(thetas, no_starts, residuals, valid, energy_of, energy, enough)
         gained, damping = energy - float(values[best]), float(here.damping * _DAMPINGS[best])
         scale, after = self._scaled(view, precision, None), replace(here, iteration=here.iteration + 1)
         after = replace(after, scale=scale, axes=self._axes(view, here.theta, hessian, scale), noise=noise)
@@ -548,13 +553,16 @@ class SegmentSolver:
             if not here.enough:
                 noise = updated_noise(view, moments, noise, here.theta, here.starts[keep], self.prior, not here.white)
                 tolerance = self.tuning.tolerance * max(view.num_theta, 1)
-                trial, lengths = self._tried(view, here, lin, moments, noise, here.starts[keep], tolerance)
+                own = here.starts[keep], here.held[keep]
+                trial, lengths = self._tried(view, here, lin, moments, noise, *own, tolerance)
         if here.enough:
             return self._ended(state, replace(here, noise=noise), lin, moments, keep, view, True)
         scale, axes = (scale, here.axes) if lengths is None else lengths
-        exact = here.exact if trial.expected < tolerance else abs(trial.straight / trial.expected - 1) < 0.05
+        exact = here.exact if trial.expected < tolerance else abs(trial.gained / trial.expected - 1) < 0.05
         after = replace(here, iteration=here.iteration + 1, noise=noise, gained=trial.gained)
-        after = replace(after, exact=exact, scale=scale, axes=axes)
+        damped = here.held.copy()
+        damped[keep] = trial.held
+        after = replace(after, exact=exact, scale=scale, axes=axes, held=damped)
         slow = trial.gained < tolerance and (here.damping <= 1.0 or here.gained < tolerance)
         small = trial.expected < tolerance or slow
         settled = small and gain_of_noise(moments, here.noise, noise) < tolerance
@@ -571,7 +579,7 @@ class SegmentSolver:
                 state = self._recorded(state, self._optimum(state, after, lin, moments, keep, view, False, True))
                 return replace(state, here=replace(after, part=part, residual=None, starts_jacobian=None))
             return self._ended(state, after, lin, moments, keep, view, settled or stuck)
-        foretold = trial.straight > 0.75 * trial.expected
+        foretold = trial.gained > 0.75 * trial.expected
         kept = lin.jacobian[..., view.num_theta :] if foretold and view.num_start else None
         after = replace(after, starts_jacobian=None if kept is None else np.ascontiguousarray(kept))
         if trial.gained <= 0:
@@ -651,6 +659,7 @@ class SegmentSolver:
         moments: Moments,
         noise: Noise,
         starts: FloatArray,
+        held: FloatArray,
         tolerance: float,
     ) -> tuple[_Trial, tuple[FloatArray, FloatArray] | None]:
         """The best of a few damped steps of theta and the initial states, and lengths of the next differences."""
@@ -660,7 +669,7 @@ class SegmentSolver:
         pull, thetas, changes, expected = -view.start_precision * starts, [], [], 0.0
         scale = None
         for k, damping in enumerate(self._dampings(here)):
-            solved = eliminate_starts(normal, n, view.start_precision, pull, float(damping))
+            solved = eliminate_starts(normal, n, view.start_precision, pull, damping + held[:, None])
             hessian = solved.precision + self.prior.precision + FLAT_PRECISION * np.eye(n)
             gradient = solved.gradient + self.prior.pull(here.theta)
             theta = self._moved(hessian, gradient, here.theta, float(damping))
@@ -672,40 +681,16 @@ class SegmentSolver:
                 lengths = self._scaled(view, solved.precision, view.start_precision + diagonal)
                 scale = lengths, self._axes(view, here.theta, hessian, lengths)
                 if expected < tolerance:
-                    return _Trial(here.theta, starts, lin.residual, 0.0, expected, 0.0, here.damping), scale
+                    return _Trial(here.theta, starts, lin.residual, 0.0, expected, here.damping, held), scale
             thetas.append(theta)
             changes.append(solved.blocks(move))
-        stacked, all_starts = np.stack(thetas), starts + np.stack(changes)
-        best, residuals, values = best_step(view, stacked, all_starts, energy, now, 0.1 * tolerance)
+        stacked = np.stack(thetas)
+        all_starts, residuals, valid, shares = stepped_starts(view, noise, stacked, starts, np.stack(changes))
+        best, values = best_step(stacked, all_starts, residuals, valid, energy, now, 0.1 * tolerance)
         damping = float(here.damping * _DAMPINGS[best])
         gained = now - float(values[best])
-        trial = _Trial(stacked[best], all_starts[best], residuals[best], gained, expected, gained, damping)
-        point, foretold = _Point(stacked[0], all_starts[0], residuals[0], float(values[0])), now - expected
-        short = gained < 0.75 * expected and np.isfinite(values[0]) and not self._beginnings and here.iteration >= 10
-        for _ in range(self.tuning.corrections if short else 0):
-            before = point
-            try:
-                point = self._corrected(view, here, lin, energy, point)
-            except BudgetExhausted:
-                self.windows.short = True
-                break
-            if now - point.energy > trial.gained + 0.1 * tolerance:
-                damping = float(here.damping * _DAMPINGS[0])
-                trial = _Trial(*point[:3], now - point.energy, expected, gained, damping)
-            if point.energy - foretold > 0.6 * (before.energy - foretold):
-                break
-        return trial, scale
-
-    def _corrected(self, view: Windows, here: Here, lin: Linearisation, energy: WindowEnergy, at: _Point) -> _Point:
-        """A further step by the same linearisation, from where an earlier one led (V. Shamanskii 1967)."""
-        n, damping = view.num_theta, float(here.damping * _DAMPINGS[0])
-        normal = view.moments(replace(lin, residual=at.residual), white=here.white).normal(energy.noise)
-        solved = eliminate_starts(normal, n, view.start_precision, -view.start_precision * at.starts, damping)
-        hessian = solved.precision + self.prior.precision + FLAT_PRECISION * np.eye(n)
-        theta = self._moved(hessian, solved.gradient + self.prior.pull(at.theta), at.theta, damping)
-        starts = at.starts + solved.blocks(theta - at.theta)
-        (residual,), (valid,) = view.residuals(theta[None], starts[None])
-        return _Point(theta, starts, residual, energy(theta, starts, residual) if valid else np.inf)
+        held = np.where(shares[best] < 1, np.maximum(10 * held, 1.0), np.where(held > 0.1, 0.1 * held, 0.0))
+        return _Trial(stacked[best], all_starts[best], residuals[best], gained, expected, damping, held), scale
 
     def _leaves_no_room(self) -> bool:
         """Whether the budget leaves no room for another step."""
@@ -990,28 +975,59 @@ def is_back(theta: FloatArray, begin: FloatArray, optimum: FloatArray, precision
     return bool((left < np.maximum(1.0, 0.1 * whole)).all())
 
 
+def stepped_starts(
+    view: Windows, noise: Noise, thetas: FloatArray, starts: FloatArray, changes: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray]:
+    """Initial states of steps, each segment's change as long as fits that segment best, by itself.
+
+    A joint that sticks or slips makes one segment jump. Damping for its sake would hold all the others back.
+
+    Args:
+        view: K segments.
+        noise: (C,) of the residuals.
+        thetas: (M, N), of the steps.
+        starts: (K, D), where they begin.
+        changes: (M, K, D), of the whole steps.
+
+    Returns:
+        Starts (M, K, D), residuals (M, K, L, C), which of the M are valid, and the share of each change (M, K).
+    """
+    if not view.num_start:
+        return starts + changes, *view.residuals(thetas, starts + changes), np.ones(changes.shape[:2])
+    tried = starts + _SHARES[:, None, None, None] * changes
+    shape = tried.shape[:2]
+    flat = tried.reshape(-1, *starts.shape)
+    residuals, valid = view.residuals(np.tile(thetas, (len(_SHARES), 1)), flat)
+    energies = view.energies(flat, residuals, noise)
+    energies[~valid] = np.inf
+    best = energies.reshape(*shape, -1).argmin(0)
+    rows, segments = np.arange(shape[1])[:, None], np.arange(len(starts))
+    residuals, whole = residuals.reshape(*shape, *residuals.shape[1:]), np.asarray(valid.reshape(shape).any(0))
+    return tried[best, rows, segments], residuals[best, rows, segments], whole, _SHARES[best]
+
+
 def best_step(
-    view: Windows,
     thetas: FloatArray,
     starts: FloatArray,
+    residuals: FloatArray,
+    valid: BoolArray,
     energy: Callable[[FloatArray, FloatArray, FloatArray], float],
     now: float,
     slack: float,
-) -> tuple[int, FloatArray, FloatArray]:
-    """Of ever shorter steps to thetas (M, N) and starts (M, W, D) the best: its number, all residuals and energies.
+) -> tuple[int, FloatArray]:
+    """Of ever shorter steps to thetas (M, N) and starts (M, W, D) with their residuals the best: its number, energies.
 
     From an energy ``now`` it is the shortest that gains half of what the best gains, and all but ``slack`` nats: where
     a log tells little, parameters stay near the model as given.
     """
-    residuals, valid = view.residuals(thetas, starts)
     each = zip(thetas, starts, residuals, valid, strict=True)
     values = np.array([energy(t, s, r) if ok else np.inf for t, s, r, ok in each])
     values[np.isnan(values)] = np.inf
     lowest = float(values.min())
     if lowest == np.inf:  # as where the simulation diverges from here on
-        return len(values) - 1, residuals, values
+        return len(values) - 1, values
     best = int(np.flatnonzero(values <= lowest + min(slack, max(0.5 * (now - lowest), 0.0)))[-1])
-    return best, residuals, values
+    return best, values
 
 
 def _log_errors(view: Windows, residual: FloatArray) -> FloatArray:
