@@ -14,11 +14,11 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
+from sipe_bayes.calibration.column_names import Kind, read_name
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_fields import ConfigError
 from sipe_bayes.calibration.config_tables import Command
-from sipe_bayes.calibration.init.columns.names import Kind, read_name
-from sipe_bayes.calibration.init.machine import Drive, drive_of, full_of
+from sipe_bayes.calibration.machine import Drive, drive_of, full_of
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.units import DIMENSIONS, UNITS, find_unit, unit_words
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec

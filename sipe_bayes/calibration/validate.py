@@ -9,23 +9,23 @@ from pathlib import Path
 
 import numpy as np
 
+from sipe_bayes.calibration.column_names import read_name
 from sipe_bayes.calibration.config import Config, load_config
 from sipe_bayes.calibration.config_tables import Command, Measurement
 from sipe_bayes.calibration.gathered import no_rigid_bodies
 from sipe_bayes.calibration.init.cases import Source, case_of, rough_unknowns, tried_part
-from sipe_bayes.calibration.init.columns.match import Match
-from sipe_bayes.calibration.init.columns.names import read_name
-from sipe_bayes.calibration.init.columns.signals import turn_of
 from sipe_bayes.calibration.init.decisions import DECIDED, Case, Search, decide, searched
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading
-from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.matching import Match
 from sipe_bayes.calibration.init.oddities import oddities
 from sipe_bayes.calibration.init.readings import with_velocities
 from sipe_bayes.calibration.init.regression import Regression
 from sipe_bayes.calibration.init.tables import Opened, open_table
 from sipe_bayes.calibration.init.unknowns.effects import delay_of
+from sipe_bayes.calibration.machine import Machine
 from sipe_bayes.calibration.problem import environment_of
 from sipe_bayes.calibration.readers.tables import read_table
+from sipe_bayes.calibration.signals import turn_of
 from sipe_bayes.core.finding_advice import ADVICE
 from sipe_bayes.core.trajectory import Trajectory
 from sipe_bayes.core.units import find_unit

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.machine import Machine
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.laws.base import Law, LawError
 from sipe_bayes.envs.laws.bound import declare, laws_of

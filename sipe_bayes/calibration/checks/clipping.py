@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sipe_bayes.calibration.init.columns.signals import likeness
+from sipe_bayes.calibration.signals import likeness
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.options import Options, option
 

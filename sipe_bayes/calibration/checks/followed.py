@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import mujoco
 
-from sipe_bayes.calibration.init.machine import Drive
 from sipe_bayes.calibration.init.regression import Regression
+from sipe_bayes.calibration.machine import Drive
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.findings import Code, Finding, finding
 

@@ -13,10 +13,10 @@ from sipe_bayes.calibration.config_fields import ConfigError, one_line
 from sipe_bayes.calibration.config_tables import LogEntry
 from sipe_bayes.calibration.init.decisions import GYRO_WORDS, Case
 from sipe_bayes.calibration.init.draft import Draft, Reading, Unknown, unit_words
-from sipe_bayes.calibration.init.machine import Machine, Sizes
 from sipe_bayes.calibration.init.regression import Gyro, Regression
 from sipe_bayes.calibration.init.unknowns.candidates import as_parameters, candidates
 from sipe_bayes.calibration.logs import load_logs
+from sipe_bayes.calibration.machine import Machine, Sizes
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.smoothing import filled
 from sipe_bayes.core.telling import Tell, silent

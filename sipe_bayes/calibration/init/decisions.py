@@ -26,8 +26,8 @@ from sipe_bayes.calibration.init.draft import (
     turned,
     unit_words,
 )
-from sipe_bayes.calibration.init.machine import Drive, Joint, Machine
 from sipe_bayes.calibration.init.regression import Assumption, Outcome, Regression
+from sipe_bayes.calibration.machine import Drive, Joint, Machine
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.telling import Tell, silent
 from sipe_bayes.core.units import find_unit

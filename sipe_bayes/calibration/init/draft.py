@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sipe_bayes.calibration.column_names import Kind, pieces_of
 from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_fields import Use
-from sipe_bayes.calibration.init.columns.match import Match
-from sipe_bayes.calibration.init.columns.names import Kind, pieces_of
-from sipe_bayes.calibration.init.machine import Drive, Machine
+from sipe_bayes.calibration.init.matching import Match
 from sipe_bayes.calibration.init.tables import Clock
+from sipe_bayes.calibration.machine import Drive, Machine
 
 Row = dict[str, object]
 _IN_TURNS = {"estimate", "input", "odrive", "turns"}  # words of columns that drives log in turns

@@ -15,11 +15,11 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from sipe_bayes.calibration.init.cases import Source, case_of, loaded
-from sipe_bayes.calibration.init.columns.match import Match
-from sipe_bayes.calibration.init.columns.signals import Likeness
 from sipe_bayes.calibration.init.draft import Draft, Reading
-from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.matching import Match
 from sipe_bayes.calibration.init.regression import turning_of
+from sipe_bayes.calibration.machine import Machine
+from sipe_bayes.calibration.signals import Likeness
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.smoothing import filled
 from sipe_bayes.core.units import find_unit, unit_words

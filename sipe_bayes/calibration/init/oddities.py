@@ -9,11 +9,11 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from sipe_bayes.calibration.init.columns.names import Kind, read_name
+from sipe_bayes.calibration.column_names import Kind, read_name
 from sipe_bayes.calibration.init.decisions import Case, scale_of, tied_of
 from sipe_bayes.calibration.init.draft import Reading
-from sipe_bayes.calibration.init.machine import Drive
 from sipe_bayes.calibration.init.tables import Opened, leaf
+from sipe_bayes.calibration.machine import Drive
 from sipe_bayes.core.arrays import BoolArray, FloatArray
 
 _AT_LIMIT, _NEAR = 0.02, 0.005  # share of the samples; of a joint's range, what is at its limit

@@ -12,11 +12,8 @@ import mujoco
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from sipe_bayes.calibration.column_names import pieces_of, vocabulary
 from sipe_bayes.calibration.init.cases import Source, case_of, gyros_of, rough_unknowns, tried_part
-from sipe_bayes.calibration.init.columns.match import Match, Matches
-from sipe_bayes.calibration.init.columns.matching import match_columns
-from sipe_bayes.calibration.init.columns.names import pieces_of
-from sipe_bayes.calibration.init.columns.vocabulary import TURNS
 from sipe_bayes.calibration.init.decisions import (
     Case,
     absolute_angles,
@@ -29,7 +26,7 @@ from sipe_bayes.calibration.init.decisions import (
 )
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading, Unknown
 from sipe_bayes.calibration.init.forces import with_forces
-from sipe_bayes.calibration.init.machine import Drive, Machine, touching_bodies
+from sipe_bayes.calibration.init.matching import Match, Matches, match_columns
 from sipe_bayes.calibration.init.oddities import oddities
 from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
 from sipe_bayes.calibration.init.regression import Outcome, Regression
@@ -39,6 +36,7 @@ from sipe_bayes.calibration.init.unknowns.candidates import candidates, scale_is
 from sipe_bayes.calibration.init.unknowns.choice import RELATIVE, chosen, roomy, sprung
 from sipe_bayes.calibration.init.unknowns.contacts import nameless
 from sipe_bayes.calibration.init.unknowns.effects import delay_of, fit_unknowns
+from sipe_bayes.calibration.machine import Drive, Machine, touching_bodies
 from sipe_bayes.calibration.readers.base import LogError
 from sipe_bayes.calibration.readers.many import episodes_of, matching
 from sipe_bayes.calibration.readers.numbered import starred
@@ -195,7 +193,7 @@ def _check_some(machine: Machine, matches: Matches, opened: Opened, file: Path) 
 
 def _resolved(opened: Opened) -> list[str]:
     """What is to be said of columns that are cosines and sines."""
-    columns = [column for column in opened.columns if TURNS & {*pieces_of(column)}]
+    columns = [column for column in opened.columns if vocabulary().of("resolved") & {*pieces_of(column)}]
     if not columns:
         return []
     return [

@@ -8,14 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sipe_bayes.calibration.init.columns.match import Match, Matches
-from sipe_bayes.calibration.init.columns.names import Kind, Label, pieces_of, read_name
-from sipe_bayes.calibration.init.columns.signals import Slope, likeness, slope_of, turn_of, white_share
-from sipe_bayes.calibration.init.columns.vocabulary import SIDES
+from sipe_bayes.calibration.column_names import Kind, Label, pieces_of, read_name, vocabulary
 from sipe_bayes.calibration.init.draft import Reading, Scale
-from sipe_bayes.calibration.init.machine import Actuator, Drive, Machine
+from sipe_bayes.calibration.init.matching import Match, Matches
 from sipe_bayes.calibration.init.shares import with_shares
 from sipe_bayes.calibration.init.tables import Clock
+from sipe_bayes.calibration.machine import Actuator, Drive, Machine
+from sipe_bayes.calibration.signals import Slope, likeness, slope_of, turn_of, white_share
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.units import find_unit, unit_words
 
@@ -123,7 +122,8 @@ def counting_alike(positions: Sequence[Reading], machine: Machine) -> list[Readi
     def stem(reading: Reading) -> tuple[str, ...]:
         """Nothing without a side."""
         pieces = pieces_of(f"{reading.match.column}_{names[reading.match.target]}")
-        return tuple(p for p in pieces if p not in SIDES) if SIDES.intersection(pieces) else ()
+        sides = vocabulary().of("side")
+        return tuple(p for p in pieces if p not in sides) if sides.intersection(pieces) else ()
 
     left: dict[tuple[str, ...], set[Scale]] = {}
     for reading in positions:

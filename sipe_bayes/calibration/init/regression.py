@@ -19,7 +19,7 @@ import numpy as np
 import scipy.optimize
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-from sipe_bayes.calibration.init.machine import Drive, drive_of
+from sipe_bayes.calibration.machine import Drive, drive_of
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.rotations import bridged
 from sipe_bayes.core.trajectory import Trajectory

@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sipe_bayes.calibration.init.columns.names import pieces_of
-from sipe_bayes.calibration.init.columns.signals import likeness
+from sipe_bayes.calibration.column_names import pieces_of
 from sipe_bayes.calibration.init.draft import Reading, Scale
-from sipe_bayes.calibration.init.machine import Drive, Joint, Machine
+from sipe_bayes.calibration.machine import Drive, Joint, Machine
+from sipe_bayes.calibration.signals import likeness
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.units import find_unit
 

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from sipe_bayes.calibration.column_names import Kind, read_name
 from sipe_bayes.calibration.config_fields import listed
-from sipe_bayes.calibration.init.columns.names import Kind, read_name
-from sipe_bayes.calibration.init.columns.signals import time_unit
 from sipe_bayes.calibration.readers.base import Columns, LogError
 from sipe_bayes.calibration.readers.many import clock_of, episode, episode_numbers, with_clock
 from sipe_bayes.calibration.readers.numbered import gathered, numbered
 from sipe_bayes.calibration.readers.tables import read_table
+from sipe_bayes.calibration.signals import time_unit
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.units import find_unit
 

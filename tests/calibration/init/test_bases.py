@@ -5,11 +5,11 @@ from __future__ import annotations
 import mujoco
 import pytest
 
+from sipe_bayes.calibration.column_names import read_name
 from sipe_bayes.calibration.init.cases import rough_unknowns
-from sipe_bayes.calibration.init.columns.match import Match
-from sipe_bayes.calibration.init.columns.names import read_name
 from sipe_bayes.calibration.init.draft import Reading
-from sipe_bayes.calibration.init.machine import Machine, base_joints, bases
+from sipe_bayes.calibration.init.matching import Match
+from sipe_bayes.calibration.machine import Machine, base_joints, bases
 
 WHEEL = '<body name="wheel"><joint name="roll"/><geom size=".05" mass=".1"/></body>'
 ARM = '<body name="arm"><joint name="swing" damping=".1"/><geom size=".05" mass=".1"/></body>'

@@ -10,10 +10,10 @@ import pytest
 
 from sipe_bayes.calibration.init.cases import rough_unknowns
 from sipe_bayes.calibration.init.draft import Unknown
-from sipe_bayes.calibration.init.machine import Machine
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.unknowns.candidates import as_parameters
 from sipe_bayes.calibration.init.unknowns.contacts import nameless
+from sipe_bayes.calibration.machine import Machine
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.envs.targets import bind

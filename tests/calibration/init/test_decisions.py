@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from sipe_bayes.calibration.init.columns.match import SURE, Match
-from sipe_bayes.calibration.init.columns.names import read_name
+from sipe_bayes.calibration.column_names import read_name
 from sipe_bayes.calibration.init.decisions import guessed
 from sipe_bayes.calibration.init.draft import Reading, Scale
+from sipe_bayes.calibration.init.matching import SURE, Match
 
 
 def counting(column: str, turn: int) -> Reading:

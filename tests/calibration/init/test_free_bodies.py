@@ -11,12 +11,12 @@ import pytest
 from typer.testing import CliRunner
 
 from sipe_bayes.calibration.init.cases import rough_unknowns
-from sipe_bayes.calibration.init.columns.matching import match_columns
 from sipe_bayes.calibration.init.draft import Draft, questions
-from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.matching import match_columns
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.readings import first_readings
 from sipe_bayes.calibration.init.write import summary, toml_of
+from sipe_bayes.calibration.machine import Machine
 from sipe_bayes.cli.app import app
 
 PUSHED = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>

@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sipe_bayes.calibration.init.columns.names import read_name
-from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.column_names import read_name
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.readings import _pulse
 from sipe_bayes.calibration.init.write import toml_of
+from sipe_bayes.calibration.machine import Machine
 from sipe_bayes.calibration.problem import prepare
 from sipe_bayes.calibration.validate import validate_config
 from sipe_bayes.core.arrays import FloatArray

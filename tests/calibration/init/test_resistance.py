@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from sipe_bayes.calibration.init.machine import Machine, Sizes
 from sipe_bayes.calibration.init.unknowns.resistance import of_tendons
+from sipe_bayes.calibration.machine import Machine, Sizes
 
 HAND = """<mujoco><compiler angle="radian"/><worldbody><site name="anchor" pos="-.03 0 -.01"/>
   <body><joint name="mcp" axis="0 1 0" range="0 2"/><geom type="capsule" fromto="0 0 0 .05 0 0" size=".01" mass=".05"/>

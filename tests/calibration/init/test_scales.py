@@ -9,15 +9,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from sipe_bayes.calibration.column_names import read_name
 from sipe_bayes.calibration.config import load_config
-from sipe_bayes.calibration.init.columns.match import Match
-from sipe_bayes.calibration.init.columns.names import read_name
 from sipe_bayes.calibration.init.decisions import as_well
 from sipe_bayes.calibration.init.draft import Draft, Reading, Scale
-from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.matching import Match
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.readings import counting_alike
 from sipe_bayes.calibration.init.write import toml_of
+from sipe_bayes.calibration.machine import Machine
 from sipe_bayes.calibration.problem import prepare
 from sipe_bayes.calibration.readers.base import LogError
 from sipe_bayes.core.arrays import FloatArray

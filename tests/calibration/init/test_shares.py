@@ -10,15 +10,15 @@ import pandas as pd
 import pytest
 
 from sipe_bayes.calibration.config import load_config
-from sipe_bayes.calibration.init.columns.matching import match_columns
 from sipe_bayes.calibration.init.draft import Draft, Reading, Scale, questions
-from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.matching import match_columns
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.readings import first_readings
 from sipe_bayes.calibration.init.shares import BOTH_WAYS, PERCENT
 from sipe_bayes.calibration.init.tables import Clock
 from sipe_bayes.calibration.init.write import summary, toml_of
 from sipe_bayes.calibration.logs import load_log
+from sipe_bayes.calibration.machine import Machine
 from sipe_bayes.core.arrays import FloatArray
 
 ARM = """<mujoco><compiler angle="radian"/><option timestep="0.01" integrator="implicitfast"/>

@@ -6,17 +6,16 @@ import mujoco
 import numpy as np
 import pytest
 
-from sipe_bayes.calibration.init.columns.match import Match
-from sipe_bayes.calibration.init.columns.matching import match_columns
-from sipe_bayes.calibration.init.columns.names import read_name
+from sipe_bayes.calibration.column_names import read_name
 from sipe_bayes.calibration.init.draft import Reading, Unknown
-from sipe_bayes.calibration.init.machine import Machine, Sizes
+from sipe_bayes.calibration.init.matching import Match, match_columns
 from sipe_bayes.calibration.init.readings import first_readings
 from sipe_bayes.calibration.init.regression import Outcome
 from sipe_bayes.calibration.init.tables import Clock
 from sipe_bayes.calibration.init.unknowns.candidates import candidates, least_of, springs
 from sipe_bayes.calibration.init.unknowns.choice import roomy, sprung, told_apart
 from sipe_bayes.calibration.init.unknowns.effects import Fit, delay_of
+from sipe_bayes.calibration.machine import Machine, Sizes
 
 
 @pytest.mark.parametrize(

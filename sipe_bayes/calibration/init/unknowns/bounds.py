@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.calibration.init.draft import Unknown, rounded_up
-from sipe_bayes.calibration.init.machine import Machine, Sizes
 from sipe_bayes.calibration.init.regression import Outcome, Regression
+from sipe_bayes.calibration.machine import Machine, Sizes
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.envs.targets import bind

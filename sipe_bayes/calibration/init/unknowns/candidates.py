@@ -9,11 +9,11 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from sipe_bayes.calibration.init.columns.names import Kind
+from sipe_bayes.calibration.column_names import Kind
 from sipe_bayes.calibration.init.draft import Reading, Unknown
-from sipe_bayes.calibration.init.machine import Actuator, Drive, Joint, Machine, Sizes, bases
 from sipe_bayes.calibration.init.unknowns.contacts import contacts, word_of
 from sipe_bayes.calibration.init.unknowns.resistance import of_joint, of_tendons
+from sipe_bayes.calibration.machine import Actuator, Drive, Joint, Machine, Sizes, bases
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.inertia import body_frame_inertia
 from sipe_bayes.envs.internal.closed_chains import dependent_joints

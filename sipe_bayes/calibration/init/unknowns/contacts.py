@@ -9,7 +9,7 @@ from itertools import takewhile
 import mujoco
 
 from sipe_bayes.calibration.init.draft import Unknown, rounded_up
-from sipe_bayes.calibration.init.machine import counts, friction_of, own_friction, top_of, touched_by
+from sipe_bayes.calibration.machine import counts, friction_of, own_friction, top_of, touched_by
 
 _SLIPPERY = 0.02  # the least friction
 

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 
 from sipe_bayes.calibration.init.draft import Unknown, rounded_up
-from sipe_bayes.calibration.init.machine import Actuator, Joint, Sizes
 from sipe_bayes.calibration.init.unknowns.contacts import word_of
+from sipe_bayes.calibration.machine import Actuator, Joint, Sizes
 
 
 def of_joint(model: mujoco.MjModel, joint: Joint, sizes: Sizes, rotor: bool = True) -> list[Unknown]:

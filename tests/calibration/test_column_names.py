@@ -1,8 +1,13 @@
 """What names say."""
 
+from collections.abc import Iterator
+from pathlib import Path
+
 import pytest
 
-from sipe_bayes.calibration.init.columns.names import Kind, alike, is_accelerometer, is_gyro, read_name
+from sipe_bayes.calibration.column_names import Kind, alike, read_name, vocabulary
+from sipe_bayes.calibration.config_fields import ConfigError
+from sipe_bayes.calibration.init.matching import is_accelerometer, is_gyro
 
 
 @pytest.mark.parametrize(
@@ -93,3 +98,72 @@ def test_an_accelerometer_is_known_whatever_stands_before(column: str) -> None:
     """Its letter is also ampere's."""
     label = read_name(column)
     assert is_accelerometer(label, label.vector)
+
+
+@pytest.mark.parametrize(
+    ("column", "kind", "words", "number"),
+    [
+        ("/joint_states.position[drive_cmd]", Kind.POSITION, ("drive", "cmd"), None),  # whatever joints are called
+        ("/arm_controller/state.desired.positions[2]", Kind.SETPOINT, (), 2),
+        ("action.elbow_flex.pos", Kind.SETPOINT, ("elbow", "flex"), None),
+        ("control.positions[elbow]", Kind.SETPOINT, ("elbow",), None),
+        ("joint_pos_target_3", Kind.SETPOINT, (), 3),
+        ("Present_Input_Voltage", Kind.SUPPLY, (), None),
+        ("elbow_goal_velocity", Kind.SPEED_SETPOINT, ("elbow",), None),
+        ("torque_enable", Kind.OTHER, ("enable",), None),
+        ("actuator_outputs[1]", Kind.DUTY, ("actuator", "outputs"), 1),
+        ("vehicle_attitude.q[0]", Kind.QUATERNION, ("vehicle", "attitude"), 0),
+        ("axis_Winkel_Grad", Kind.POSITION, ("axis",), None),
+    ],
+)
+def test_names_of_dialects(column: str, kind: Kind, words: tuple[str, ...], number: int | None) -> None:
+    label = read_name(column)
+    assert (label.kind, label.number) == (kind, number)
+    assert {*words} <= {*label.words}
+
+
+@pytest.fixture
+def users_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    (tmp_path / "sipe_bayes").mkdir()
+    vocabulary.cache_clear()
+    yield tmp_path / "sipe_bayes" / "column_names.toml"
+    vocabulary.cache_clear()
+
+
+def test_a_users_file_comes_first(users_file: Path) -> None:
+    assert (read_name("hoek_2").kind, read_name("x").kind) == (Kind.UNKNOWN, Kind.POSITION)
+    users_file.write_text(
+        """[dutch]
+        words = { angle = "hoek", other = "x" }
+        units = { deg = "gr" }
+        patterns = { "plc.*.{joint}_act" = "position mrad", "as{joint}_stand" = "position" }
+        """
+    )
+    vocabulary.cache_clear()
+    assert (read_name("hoek_2_gr").kind, read_name("hoek_2_gr").unit) == (Kind.POSITION, "deg")
+    assert read_name("x").kind == Kind.OTHER
+    label = read_name("plc.unit4.elbow_act")
+    assert (label.kind, label.unit, label.words) == (Kind.POSITION, "mrad", ("elbow",))
+    assert read_name("theta_dot").kind == Kind.VELOCITY  # what the package knows stays
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[mine.words]\nangel = 'hoek'", "key `mine.words.angel`: unknown; did you mean 'angle'"),
+        ("[mine.units]\ndegree = 'gr'", "key `mine.units.degree`: unknown; "),
+        ("[mine.patterns]\n'*_stand' = 'positon'", "got 'positon'; did you mean 'position'"),
+        ("[mine]\nwrods = {}", "key `mine.wrods`: "),
+        ("[mine.words]\nangle = 3", "key `mine.words.angle`: "),
+        ("[mine", "not valid TOML"),
+    ],
+)
+def test_a_wrong_users_file_is_named_in_one_line(text: str, message: str, users_file: Path) -> None:
+    users_file.write_text(text)
+    vocabulary.cache_clear()
+    with pytest.raises(ConfigError) as caught:
+        read_name("q")
+    assert str(users_file) in str(caught.value)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)

@@ -6,9 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from sipe_bayes.calibration.init.columns.match import Matches
-from sipe_bayes.calibration.init.columns.matching import match_columns
-from sipe_bayes.calibration.init.machine import Machine
+from sipe_bayes.calibration.init.matching import Matches, match_columns
+from sipe_bayes.calibration.machine import Machine
 
 POSE = ["px", "py", "pz", "qw", "qx", "qy", "qz"]
 

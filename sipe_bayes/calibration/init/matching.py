@@ -2,20 +2,62 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.optimize
 
-from sipe_bayes.calibration.init.columns.match import SURE, Match, Matches
-from sipe_bayes.calibration.init.columns.names import Kind, Label, alike, is_exactly, number_of, pieces_of, read_name
-from sipe_bayes.calibration.init.columns.signals import slope_of
-from sipe_bayes.calibration.init.columns.vectors import held_open, match_vectors
-from sipe_bayes.calibration.init.columns.vocabulary import COMMANDS, LETTERS, OF_BODIES, OF_NO_JOINT
-from sipe_bayes.calibration.init.machine import Actuator, Drive, Joint, Machine
+from sipe_bayes.calibration.column_names import Kind, Label, alike, pieces_of, read_name, unit_of, vocabulary
+from sipe_bayes.calibration.machine import Actuator, Drive, Joint, Machine
+from sipe_bayes.calibration.signals import slope_of
 from sipe_bayes.core.arrays import FloatArray
+
+SURE = 1.0
+"""A score from which names alone decide."""
+
+
+@dataclass(frozen=True)
+class Match:
+    """Columns that are taken for a quantity of the model; score: how well the names agree; named: whether any does."""
+
+    columns: tuple[str, ...]
+    target: str
+    label: Label
+    score: float
+    quaternion: str = ""
+    named: bool = False
+
+    @property
+    def column(self) -> str:
+        """The one column, or the first."""
+        return self.columns[0]
+
+    @property
+    def sure(self) -> bool:
+        """Whether names alone tell it."""
+        return self.score >= SURE
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Every quantity of the model that has a column; rivals: commands that would do as well; doubts: of all columns.
+
+    forces: what actuators with another command apply at their joints.
+    """
+
+    positions: tuple[Match, ...]
+    velocities: tuple[Match, ...]
+    commands: tuple[Match, ...]
+    vectors: tuple[Match, ...]
+    rivals: tuple[Match, ...]
+    left: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
+    forces: tuple[Match, ...] = ()
+
 
 Table = Mapping[str, FloatArray]
 Families = Mapping[str, list[Label]]
@@ -103,7 +145,8 @@ def _own_words(machine: Machine) -> set[str]:
     """
     joints = {piece for joint in machine.joints for piece in pieces_of(joint.name)}
     driving = {actuator.name for actuator in machine.actuators}
-    own = joints & {*OF_BODIES, *LETTERS, *OF_NO_JOINT, *(COMMANDS - driving)}
+    gauges = {"bar", "mbar", "pa", "kpa", "mpa", "kg"}
+    own = joints & (vocabulary().of("short") | gauges | (vocabulary().of("command") - driving))
     sensors = {kind for _, kind in machine.sensors}
     for kind, letter in (("gyro", "g"), ("accelerometer", "a")):
         if not machine.bodies and kind not in sensors:
@@ -395,3 +438,153 @@ def _by_slopes(family: Sequence[Label], labels: Sequence[Label], table: Table) -
             elif any(slope_of(table[o], table[label.column]).share > 0.8 for o in others):
                 kinds[label.column] = Kind.VELOCITY
     return list(kinds.values())
+
+
+def match_vectors(machine: Machine, labels: list[Label]) -> tuple[list[Match], list[Label]]:
+    """Poses of free bodies and readings of inertial sensors: groups of three or four columns; and what is left."""
+    groups: dict[str, list[Label]] = defaultdict(list)
+    for label in labels:
+        if label.axis or label.number is not None:
+            groups[label.vector if label.axis else label.stem].append(label)
+    out: list[Match] = []
+    taken: set[str] = set()
+    for wanted, size, target_of in _wanted(machine):
+        for stem, group in groups.items():
+            part = [x for x in group if x.column not in taken]
+            fitting = [x for x in part if wanted(x, stem)]
+            if len(fitting) != size:
+                continue
+            order = "xyz" if size == 3 else ("wxyz" if fitting[0].axis in ("w", "") else "xyzw")
+            if fitting[0].axis:
+                fitting = sorted(fitting, key=lambda x: order.index(x.axis))
+            else:
+                fitting = sorted(fitting, key=lambda x: x.number or 0)
+            target, score = target_of(stem)
+            if any(m.target == target for m in out):
+                continue
+            quaternion = order if size == 4 else ""
+            columns = tuple(x.column for x in fitting)
+            taken |= set(columns)
+            sure = score if fitting[0].axis or size == 3 else 0.0
+            out.append(Match(columns, target, fitting[0], sure, quaternion))
+    return out, [x for x in labels if x.column not in taken]
+
+
+Wanted = tuple[Callable[[Label, str], bool], int, Callable[[str], tuple[str, float]]]
+
+
+def _wanted(machine: Machine) -> list[Wanted]:
+    """What vectors a model may have: whether a column is one of them, how many, and the target of a stem."""
+    out: list[Wanted] = [
+        (is_gyro if kind == "gyro" else is_accelerometer, 3, partial(_sensor, name)) for name, kind in machine.sensors
+    ]
+    if machine.bodies:
+        turns = partial(is_turn, alone=not machine.joints)
+        out.append((turns, 4, partial(_body, machine, "orientation")))
+        out.append((lambda x, s: x.kind == Kind.POSITION and not turns(x, s), 3, partial(_body, machine, "position")))
+        out.append((is_spin, 3, partial(_body, machine, "angular_velocity")))
+        out.append(
+            (lambda x, s: x.kind == Kind.VELOCITY and not is_spin(x, s), 3, partial(_body, machine, "linear_velocity"))
+        )
+    return out
+
+
+def held_open(vectors: Sequence[Match]) -> tuple[list[Match], list[str]]:
+    """Vectors, of which none that may be another one is sure unless that one is there; and what is to be said."""
+    reasons = [two_ways(m.label, m.target) if m.target.startswith("body:") else "" for m in vectors]
+    clear = {match.target for match, why in zip(vectors, reasons, strict=True) if not why}
+    other = {"linear_velocity": "angular_velocity", "angular_velocity": "linear_velocity"}
+    out, doubts = [], []
+    for match, why in zip(vectors, reasons, strict=True):
+        body, _, quantity = match.target.rpartition(".")
+        if why and ("<gyro>" in why or f"{body}.{other[quantity]}" not in clear):
+            names = ", ".join(map(repr, match.columns))
+            doubts.append(f"{names} are taken for {match.target}: {why}")
+            match = replace(match, score=0.0)
+        out.append(match)
+    return out, doubts
+
+
+def _sensor(name: str, stem: str) -> tuple[str, float]:
+    return f"sensor:{name}", SURE
+
+
+def _body(machine: Machine, quantity: str, stem: str) -> tuple[str, float]:
+    """The free body that a stem speaks of, and how sure that is."""
+    words = read_name(stem).words
+    best = max(machine.bodies, key=lambda name: alike(words, name))
+    return f"body:{best}.{quantity}", SURE if len(machine.bodies) == 1 or alike(words, best) > 0.5 else 0.0
+
+
+def is_exactly(label: Label, name: str) -> bool:
+    """Whether a column is called as something of the model, but for words of its quantity and of the log's format."""
+    own = pieces_of(name)
+    numbers = {label.number} if label.number is not None else set[int]()
+    return (
+        bool(own)
+        and {*own} <= {*pieces_of(label.column)}
+        and {*label.words} <= {*own}
+        and numbers <= {int(piece) for piece in own if piece.isdigit()}
+    )
+
+
+def number_of(name: str) -> int | None:
+    """The last number in a name of the model."""
+    numbers = re.findall(r"\d+", name)
+    return int(numbers[-1]) if numbers else None
+
+
+def _speaks(stem: str, *words: str) -> bool:
+    return any(word in stem.lower() for word in words)
+
+
+def _ends(stem: str, letter: str) -> bool:
+    """Whether a component's name, without its axis and unit, ends with a letter."""
+    pieces = pieces_of(stem)
+    units = [piece == "per" or piece.isdigit() or bool(unit_of([piece])) for piece in pieces]
+    while len(pieces) > 1 and pieces[-1] != letter and units[len(pieces) - 1]:
+        pieces.pop()
+    return pieces[-1:] == [letter]
+
+
+def is_gyro(label: Label, stem: str) -> bool:
+    """Whether a component of a vector with this name is a gyro's."""
+    return label.kind == Kind.VELOCITY and (_speaks(stem, "gyro", "omega", "ang") or _ends(stem, "g"))
+
+
+def is_accelerometer(label: Label, stem: str) -> bool:
+    """Whether it is an accelerometer's."""
+    return label.kind == Kind.ACCELERATION and (_speaks(stem, "acc", "linear") or _ends(stem, "a"))
+
+
+def is_turn(label: Label, stem: str, alone: bool = False) -> bool:
+    """Whether it is a quaternion's; alone: q[0] to q[3] of a machine without joints are one too."""
+    spelt = _speaks(stem, "quat", "orientation") or (alone and pieces_of(stem)[-1:] == ["q"])
+    return label.kind == Kind.QUATERNION or (label.number is not None and spelt)
+
+
+def is_spin(label: Label, stem: str) -> bool:
+    """Whether it is an angular velocity's."""
+    if label.kind != Kind.VELOCITY:
+        return False
+    if label.unit.startswith(("rad", "deg", "rev", "rpm")) or label.unit in ("m", "mm", "cm", "m/s", "mm/s", "cm/s"):
+        return not label.unit.startswith(("m", "cm"))
+    if _speaks(stem, "ang", "omega", "gyro"):
+        return True
+    if vocabulary().of("about") & {*pieces_of(label.column)}:
+        return not _speaks(stem, "lin")
+    return bool({"w", "g"} & {*pieces_of(stem)}) and not _speaks(stem, "vel", "lin")  # beside these `w` is the frame
+
+
+def two_ways(label: Label, target: str) -> str:
+    """Why the velocity of a body that a component's name was taken for may be another one; "" where it is clear."""
+    pieces = {*pieces_of(label.column)}
+    if label.kind != Kind.VELOCITY or _speaks(label.vector, "ang", "omega"):
+        return ""
+    if {"gx", "gy", "gz"} & pieces:
+        return "a gyro tells it in the body's own axes: if it is one, give the model a <gyro>"
+    glued, linear = bool(vocabulary().of("about") & pieces), _speaks(label.vector, "lin")
+    if label.unit or not (linear or _speaks(label.vector, "vel")) or not (glued or ("w" in pieces and not linear)):
+        return ""
+    other = "linear" if target.endswith("angular_velocity") else "angular"
+    return f"or are they its {other} velocity, since `w` is the world as well as a rate?"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from sipe_bayes.calibration.init.columns.signals import likeness, slope_of, time_unit, turn_of, white_share
+from sipe_bayes.calibration.signals import likeness, slope_of, time_unit, turn_of, white_share
 
 TIME = np.arange(2000) * 0.004
 ANGLE = np.sin(3 * TIME) + 0.3 * np.sin(11 * TIME)

@@ -1,0 +1,314 @@
+"""What the name of a column says: the kind of quantity, its unit, its number, its axis.
+
+Words, units and patterns stand in ``column_names.toml``, a section for each dialect; a user's file extends them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import os
+import re
+import tomllib
+from collections import defaultdict
+from collections.abc import Collection
+from dataclasses import dataclass
+from enum import StrEnum, auto
+from pathlib import Path
+
+from pydantic import BaseModel, TypeAdapter, ValidationError, ValidationInfo, model_validator
+
+from sipe_bayes.calibration.config_fields import ConfigError, nearest, one_line, problem
+from sipe_bayes.core.files import read_text
+from sipe_bayes.core.units import UNITS
+
+
+class Kind(StrEnum):
+    """What a column may be, by its name."""
+
+    TIME = auto()
+    EPISODE = auto()
+    POSITION = auto()
+    VELOCITY = auto()
+    ACCELERATION = auto()
+    COMMAND = auto()
+    SETPOINT = auto()  # of a position
+    SPEED_SETPOINT = auto()
+    TORQUE = auto()  # or force
+    CURRENT = auto()
+    VOLTAGE = auto()
+    DUTY = auto()  # share of the supply
+    SUPPLY = auto()  # the voltage of it
+    QUATERNION = auto()
+    OTHER = auto()  # which no joint has: temperatures, flags
+    UNKNOWN = auto()
+
+
+@dataclass(frozen=True)
+class Label:
+    """What a column's name says.
+
+    Args:
+        column: the name.
+        kind: of quantity.
+        words: of the name, without numbers, units and words of the quantity.
+        number: the last one in it.
+        stem: the name without that number; columns of one stem are a family.
+        unit: unit word; "" where it names none.
+        angular: whether it speaks of an angle; None where it says nothing.
+        axis: "x", "y", "z" or "w".
+        vector: the name without that axis; columns of one are its components.
+        measured: whether it says so, as in ``tau_measured``.
+        commanded: whether it says so, as in ``tau_cmd``.
+    """
+
+    column: str
+    kind: Kind
+    words: tuple[str, ...]
+    number: int | None
+    stem: str
+    unit: str = ""
+    angular: bool | None = None
+    axis: str = ""
+    vector: str = ""
+    measured: bool = False
+    commanded: bool = False
+
+
+_UNITS = (*UNITS, "bar", "mbar", "Pa", "kPa", "MPa")
+
+
+class Dialect(BaseModel, extra="forbid"):
+    """A section of ``column_names.toml``, which says what its keys are."""
+
+    rules: list[tuple[Kind, str]] = []
+    words: dict[str, str] = {}
+    units: dict[str, str] = {}
+    patterns: dict[str, str] = {}
+
+    @model_validator(mode="after")
+    def _check(self, info: ValidationInfo) -> Dialect:
+        known = info.context or self.words
+        for field, given, legal in (("words", self.words, known), ("units", self.units, _UNITS)):
+            for key in {*given} - {*legal}:
+                raise problem(f"unknown; {nearest(key, legal)}", field, key)
+        for pattern, value in self.patterns.items():
+            kind, _, unit = value.partition(" ")
+            if value not in _UNITS and not (kind in [*Kind] and unit in ("", *_UNITS)):
+                wrong = f"expected a kind, a unit or both, got {value!r}; {nearest(kind, Kind)}"
+                raise problem(wrong, "patterns", pattern)
+        return self
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """All sections together: words with their kinds, spellings with their units, patterns and rules in their order."""
+
+    kinds: dict[str, set[str]]
+    units: dict[str, str]
+    patterns: list[tuple[re.Pattern[str], str]]
+    rules: list[tuple[Kind, str]]
+
+    def of(self, *kinds: str) -> set[str]:
+        """The words of some kinds."""
+        return {word for word, own in self.kinds.items() if own.intersection(kinds)}
+
+
+@functools.cache
+def vocabulary() -> Vocabulary:
+    """The package's sections, and before them the user's; raises ConfigError for a file that cannot be used."""
+    package = Path(__file__).with_suffix(".toml")
+    user = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "sipe_bayes" / package.name
+    given = _dialects(package)
+    own = _dialects(user, {kind for dialect in given for kind in dialect.words}) if user.is_file() else []
+    kinds: dict[str, set[str]] = {}
+    for dialects in (given, own):
+        new: dict[str, set[str]] = defaultdict(set)
+        for kind, words in [row for dialect in dialects for row in dialect.words.items()]:
+            for word in words.split():
+                new[word].add(kind)
+        kinds |= new
+    spelt = [row for dialect in (*given, *own) for row in dialect.units.items()]
+    return Vocabulary(
+        kinds,
+        {word: unit for unit, words in spelt for word in words.split()},
+        [(_compiled(pattern), value) for dialect in (*own, *given) for pattern, value in dialect.patterns.items()],
+        [rule for dialect in (*own, *given) for rule in dialect.rules],
+    )
+
+
+def _dialects(path: Path, known: Collection[str] = ()) -> list[Dialect]:
+    text = read_text(path, "names of columns", "give a TOML file in UTF-8", ConfigError)
+    try:
+        return [*TypeAdapter(dict[str, Dialect]).validate_python(tomllib.loads(text), context=known).values()]
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}; correct that line") from None
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {one_line(error.errors()[0])}") from None
+
+
+def _compiled(pattern: str) -> re.Pattern[str]:
+    """A pattern without capitals is of any letters."""
+    text = re.escape(pattern).replace(r"\*", ".*").replace(r"\{joint\}", "(?P<joint>.+)")
+    return re.compile(text, re.IGNORECASE if pattern == pattern.lower() else 0)
+
+
+_GREEK = str.maketrans(
+    {"θ": "theta", "τ": "tau", "ω": "omega", "φ": "phi", "ϕ": "phi", "α": "alpha", "β": "beta", "ψ": "psi", "°": "deg"}
+)
+_PIECE = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_BRACKETED = re.compile(r"[\[(]\s*([^\])\d]*?[/^]?[^\])]*?)\s*[\])]")
+
+
+def read_name(column: str, own: Collection[str] = ()) -> Label:
+    """What a name says; own: words that name something of the model, whatever quantity they are elsewhere."""
+    found, kind, fixed = _pattern_of(column)
+    unit, words, numbers = _without_unit(column.translate(_GREEK), own)
+    unit = fixed or unit
+    named, words = [word for word in words if word in own], [word for word in words if word not in own]
+    flags, rest = _flags(words, unit)
+    kind = kind or next((kind for kind, rule in vocabulary().rules if _holds(rule, flags)), Kind.UNKNOWN)
+    unit = "" if "gauge" in flags and kind != Kind.OTHER else unit
+    axis = _axis(words)
+    if axis and kind in (Kind.POSITION, Kind.UNKNOWN) and _is_quaternion(words):
+        kind = Kind.QUATERNION
+    turns = bool(flags & {"in_angle", "in_angular_velocity", "gyro"})
+    slides = bool(flags & {"in_length", "in_velocity", "in_force"}) or ("length" in flags and not turns)
+    joint = found.groupdict().get("joint") if found else None
+    return Label(
+        column,
+        kind,
+        (*rest, *named) if joint is None else tuple(words_of(joint)),
+        numbers[-1] if numbers else None,
+        re.sub(r"\d+(?=\D*$)", "#", column) if numbers else column,
+        unit,
+        False if slides else True if turns or "angle" in flags else None,
+        axis,
+        _without_axis(column, words[-1]) if axis else "",
+        "measured" in flags,
+        "driven" in flags,
+    )
+
+
+def pieces_of(name: str) -> list[str]:
+    """Its words and numbers, in small letters."""
+    return [piece.lower() for piece in _PIECE.findall(name)]
+
+
+def words_of(name: str) -> list[str]:
+    """Its words, in small letters."""
+    return [piece for piece in pieces_of(name) if not piece.isdigit()]
+
+
+def unit_of(pieces: list[str]) -> str:
+    """The unit that some words of a name spell; "" for none."""
+    pieces, units = [piece for piece in pieces if piece != "per"], vocabulary().units
+    if len(pieces) == 2 and pieces[1] in ("s", "sec", "second"):
+        rate = f"{units.get(pieces[0])}/s"
+        return rate if rate in UNITS else ""
+    return units.get("_".join(pieces), "")
+
+
+def _pattern_of(column: str) -> tuple[re.Match[str] | None, Kind | None, str]:
+    """The first pattern of a dialect that fits a whole name, and the kind and unit that it tells."""
+    for pattern, value in vocabulary().patterns:
+        if found := pattern.fullmatch(column):
+            kind, _, unit = value.partition(" ")
+            return (found, Kind(kind), unit) if kind in [*Kind] else (found, None, value)
+    return None, None, ""
+
+
+def _without_unit(plain: str, own: Collection[str]) -> tuple[str, list[str], list[int]]:
+    """The unit that a name says, and its words and numbers without that."""
+    unit = ""
+    for match in _BRACKETED.finditer(plain):  # "angle [deg]", "speed (rad/s)"
+        if word := unit_of(re.findall(r"[a-z%]+", match[1].lower())):
+            unit, plain = word, plain.replace(match[0], " ")
+    unit = unit or ("%" if plain.rstrip().endswith("%") else "")  # valve_%
+    words, numbers = words_of(plain), [int(piece) for piece in pieces_of(plain) if piece.isdigit()]
+    last = re.split(r"[^A-Za-z]+", plain.rstrip("0123456789_ "))[-1]
+    spelt = [(len(_PIECE.findall(last)), [last.lower()])]  # mA, mNm, kN
+    for length, pieces in spelt * (spelt[0][0] > 1) + [(n, words[-n:]) for n in (3, 2, 1)]:  # rad_per_s, rad_s, rad
+        if unit or len(words) <= length or ({*words[-length:]} <= {*own} and words.count(words[-1]) == 1):
+            continue  # position_A1, unlike A1_current_A
+        if word := unit_of(pieces):
+            unit, words = word, words[:-length]
+    return unit, words, numbers
+
+
+_MARKS = {"format", "gripper", "pulsed", "registers", "short", "side"}  # kinds of words that are no quantities
+_WHERE = {"angle", "length", "place"}
+
+
+def _flags(words: list[str], unit: str) -> tuple[set[str], list[str]]:
+    """What the rules of ``column_names.toml`` ask for, and the words that say nothing of a quantity."""
+    known, flags, rest = vocabulary().kinds, set[str](), list[str]()
+    for word in words:
+        kinds = known.get(word, set()) - _MARKS
+        if not kinds and (whole := _derived_from(word)):
+            kinds = {"speed"} | (known[whole] & {"angle", "length"})
+        flags |= kinds
+        if not kinds and "format" not in known.get(word, ()):
+            rest.append(word)
+    if unit:
+        dimension = UNITS[unit].dimension if unit in UNITS else "mass"
+        flags |= {f"in_{dimension.replace(' ', '_')}", "quantity"} - ({"quantity"} if unit in ("us", "%") else set())
+        flags |= {"gauge"} if dimension == "mass" else {unit}
+    if words:
+        each = [known.get(word, set()) for word in words]
+        flags |= {f"last_{kind}" for kind in each[-1]} | {f"all_{kind}" for kind in set.intersection(*each)}
+    if flags & _WHERE and not {"current", "in_current"} <= flags:
+        flags |= {"where"} | ({"speed"} if words[0] == "d" else set()) | ({"derived"} if "d" in words[1:] else set())
+    flags |= {"speed"} if "dot" in words else set()
+    flags |= {"driven"} if flags & {"command", "desired"} else set()
+    spoken = {word for word in words if known.get(word, set()) & {*_WHERE, "command"}} - {"p", "a"}
+    return flags | ({"spoken"} if spoken else set()), rest
+
+
+def _holds(rule: str, flags: set[str]) -> bool:
+    return all((token.lstrip("!") in flags) != token.startswith("!") for token in rule.split())
+
+
+def _derived_from(word: str) -> str:
+    """The position whose derivative a word is by a mark: dq, qd, thetadot; "" for none."""
+    known = vocabulary().kinds
+    inner = (word.removeprefix("d"), *(word.removesuffix(end) for end in ("dot", "d", "p")))
+    return next((one for one in inner if one != word and known.get(one, set()) & _WHERE), "")
+
+
+def _axis(words: list[str]) -> str:
+    """The axis of a vector's or quaternion's component: pos_x, qw, px."""
+    last = words[-1] if words else ""
+    return last[-1] if re.fullmatch("[qprvwga]?[xyzw]", last) else ""
+
+
+def _without_axis(column: str, last: str) -> str:
+    """The name without the axis that its last word ends with, whatever unit comes after it."""
+    piece = [piece for piece in _PIECE.finditer(column) if piece[0].lower() == last][-1]
+    return column[: piece.end() - 1] + column[piece.end() :]
+
+
+def _is_quaternion(words: list[str]) -> bool:
+    return words[-1][0] == "q" or bool({"quat", "quaternion", "orientation", "rotation"} & {*words})
+
+
+def alike(words: Collection[str], *names: str) -> float:
+    """How much of a name of the model stands in a column's words, from 0 to 1, of the likest; spelt shorter counts."""
+    out = [0.0]
+    for own in map(words_of, names):
+        if own and words:
+            out.append(sum(max(_similar(a, b) for b in words) for a in own) / len(own))
+    return max(out)
+
+
+def _similar(a: str, b: str) -> float:
+    short, long = sorted((a, b), key=len)
+    if a == b:
+        return 1.0
+    if len(short) >= 2 and long.startswith(short):
+        return 0.8
+    letters = iter(long)
+    if len(short) >= 3 and long[0] == short[0] and all(letter in letters for letter in short):
+        return 0.7  # shldr, shoulder
+    ratio = difflib.SequenceMatcher(None, a, b).ratio()
+    return ratio if ratio >= 0.8 else 0.0

@@ -1,1 +1,0 @@
-"""What the columns of a log are: by their names, their numbers, and each other."""
