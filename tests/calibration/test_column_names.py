@@ -7,7 +7,6 @@ import pytest
 
 from sipe_bayes.calibration.column_names import Kind, alike, read_name, vocabulary
 from sipe_bayes.calibration.config_fields import ConfigError
-from sipe_bayes.calibration.init.matching import is_accelerometer, is_gyro
 
 
 @pytest.mark.parametrize(
@@ -83,21 +82,6 @@ def test_names_that_are_spelt_shorter_are_alike() -> None:
 def test_a_unit_behind_what_a_joint_is_called() -> None:
     assert read_name("A1_current_A", {"a"}).unit == "A"
     assert read_name("position_A1", {"a"}).unit == ""
-
-
-@pytest.mark.parametrize("column", ["gx", "gx_dps", "imu_gx_dps", "gx [deg/s]", "gyro_x_rad_s", "imu.gx_deg_per_s"])
-def test_a_gyro_is_known_with_its_unit(column: str) -> None:
-    label = read_name(column)
-    assert is_gyro(label, label.vector)
-    other = read_name(column.replace("gyro_x", "vx").replace("gx", "vx"))
-    assert not is_gyro(other, other.vector)
-
-
-@pytest.mark.parametrize("column", ["ax", "imu_ax", "imu.ax", "base_ax_m_s2", "acc_x"])
-def test_an_accelerometer_is_known_whatever_stands_before(column: str) -> None:
-    """Its letter is also ampere's."""
-    label = read_name(column)
-    assert is_accelerometer(label, label.vector)
 
 
 @pytest.mark.parametrize(

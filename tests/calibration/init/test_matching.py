@@ -130,6 +130,23 @@ def test_a_gyro_of_a_free_body(sensors: str, joint: str, target: str | None) -> 
     assert [m.column for m in matches.positions] == [joint] * bool(joint)
 
 
+@pytest.mark.parametrize(
+    ("stem", "kind"),
+    [
+        ("g{}", "gyro"), ("g{}_dps", "gyro"), ("imu_g{}_dps", "gyro"), ("g{} [deg/s]", "gyro"), ("v{}", ""),
+        ("gyro_{}_rad_s", "gyro"), ("imu.g{}_deg_per_s", "gyro"), ("imu_v{}", ""),
+        ("a{}", "accelerometer"), ("imu_a{}", "accelerometer"), ("base_a{}_m_s2", "accelerometer"),
+        ("acc_{}", "accelerometer"),
+    ],
+)  # fmt: skip
+def test_an_inertial_unit_is_known_with_its_unit_whatever_stands_before(stem: str, kind: str) -> None:
+    """The letter of an acceleration is also ampere's."""
+    sensors = "".join(f'<{one} name="{one}" site="s_j"/>' for one in ("gyro", "accelerometer"))
+    columns = [stem.format(axis) for axis in "xyz"]
+    vectors = matched(chain("j", sensors=sensors), ["q", *columns]).vectors
+    assert [(m.target, list(m.columns)) for m in vectors] == ([(f"sensor:{kind}", columns)] if kind else [])
+
+
 def test_one_rate_of_a_gyro_is_the_joints_whose_slope_it_is() -> None:
     """And no slide's, though its axis is called so; of two hinges the second, where positions tell."""
     machine = Machine.of(

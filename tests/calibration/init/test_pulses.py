@@ -99,7 +99,7 @@ def test_what_is_taken_for_a_pulse(
     xml = xml if limits else xml.replace('ctrllimited="true"', 'ctrllimited="false"')
     (actuator,) = Machine.of(mujoco.MjModel.from_xml_string(xml)).actuators
     pulse = _pulse(np.array([0.0, *widths]), actuator, read_name(column))
-    assert (None if pulse is None else pulse.none) == none
+    assert (None if pulse is None else pulse[0]) == none
 
 
 def test_a_controller_that_is_not_armed_yet_is_doubted(tmp_path: Path) -> None:

@@ -13,8 +13,7 @@ from sipe_bayes.calibration.config import load_config
 from sipe_bayes.calibration.init.draft import Draft, Reading, Scale, questions
 from sipe_bayes.calibration.init.matching import match_columns
 from sipe_bayes.calibration.init.propose import propose
-from sipe_bayes.calibration.init.readings import first_readings
-from sipe_bayes.calibration.init.shares import BOTH_WAYS, PERCENT
+from sipe_bayes.calibration.init.readings import BOTH_WAYS, PERCENT, first_readings
 from sipe_bayes.calibration.init.tables import Clock
 from sipe_bayes.calibration.init.write import summary, toml_of
 from sipe_bayes.calibration.logs import load_log
