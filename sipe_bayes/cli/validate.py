@@ -14,7 +14,7 @@ from sipe_bayes.inference.progress_bar import ProgressBar
 def validate(config: Annotated[Path, typer.Argument(help="The configuration.")]) -> None:
     """What is odd in a configuration and its logs, in seconds; exit code 1 where something is."""
     with exit_on_error():
-        from sipe_bayes.calibration.validate import validate_config
+        from sipe_bayes.calibration.init.validate import validate_config
 
         with ProgressBar(unit="configuration", counted=False) as progress:
             progress(f"holding {config} against its logs", 0, 1)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from sipe_bayes.calibration.gathered import Marginals, no_rigid_bodies
+from sipe_bayes.calibration.init.validate import validate_config
 from sipe_bayes.calibration.run import run
-from sipe_bayes.calibration.validate import validate_config
 from sipe_bayes.core.findings import Code
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.envs.mjcf import MjcfEnvironment

@@ -30,7 +30,7 @@ from sipe_bayes.calibration.init.matching import Match, Matches, match_columns
 from sipe_bayes.calibration.init.oddities import oddities
 from sipe_bayes.calibration.init.readings import first_readings, straightened, with_velocities
 from sipe_bayes.calibration.init.regression import Outcome, Regression
-from sipe_bayes.calibration.init.tables import Opened, loads, richest
+from sipe_bayes.calibration.init.tables import Opened, ask_of_columns, richest
 from sipe_bayes.calibration.init.unknowns.bounds import informed, sizes_of, started
 from sipe_bayes.calibration.init.unknowns.candidates import candidates, scale_is_open, springs
 from sipe_bayes.calibration.init.unknowns.choice import RELATIVE, chosen, roomy, sprung
@@ -101,7 +101,7 @@ def propose(
     draft = Draft(
         _relative(model_path, folder), opened.clock, opened.episodes, commands, measurements, lines, 1e-3,
         doubts=(
-            *notes_of(spec), *dropped, *matches.doubts, *loads([opened, *others]),
+            *notes_of(spec), *dropped, *matches.doubts, *ask_of_columns([opened, *others]),
             *_unmatched(model, machine, matches, commands),
         ),
         notes=tuple(nameless(model, {model.body(body).id for body in machine.bodies})),

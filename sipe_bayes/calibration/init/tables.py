@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from sipe_bayes.calibration.column_names import Kind, read_name
 from sipe_bayes.calibration.config_fields import listed
-from sipe_bayes.calibration.readers.base import Columns, LogError
+from sipe_bayes.calibration.readers.base import Columns, LogError, as_numbers, too_many
 from sipe_bayes.calibration.readers.many import clock_of, episode, episode_numbers, with_clock
 from sipe_bayes.calibration.readers.numbered import gathered, numbered
 from sipe_bayes.calibration.readers.tables import read_table
@@ -19,9 +20,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.units import find_unit
 
 _EPISODES = ("demo", "episode", "ep_", "run", "trial", "toss", "traj", "rollout", "log", "exp", "test", "swing")
-_MADE = "time"  # what a clock is called that a rate makes
 _MOST = 20_000  # rows that are looked at
-_UNLIKE = 0.3  # share of steps that are far from the usual one, beyond which a column is no clock
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class Opened:
     """A log: its clock, what numbers its episodes, its columns (n,) on one clock, and how long it is in s.
 
     Columns that do not change are none of these; of those in kg, as of a load, ``weights`` has the value. What columns
-    without a header are called is given in ``names``.
+    without a header are called is given in ``names``; ``lost`` counts cells of columns that are no numbers.
     """
 
     clock: Clock
@@ -64,27 +63,32 @@ class Opened:
     seconds: float
     weights: Mapping[str, float]
     names: tuple[str, ...] = ()
+    lost: Mapping[str, int] = field(default_factory=dict)
 
 
 def open_table(path: Path, table: Columns, rate: float | None = None) -> Opened:
     """Read what a file holds, whose rows come at ``rate`` Hz; raises LogError where nothing tells the time."""
-    table = with_clock(table, _MADE, rate)
+    table = with_clock(table, "time", rate)
     prefix = numbered(table, _EPISODES)
     table = table if prefix is None else gathered(table, prefix)
-    numbers = {name: values for name, column in table.items() if (values := _numbers(column)) is not None}
+    read = {name: own for name, column in table.items() if (own := as_numbers(column))}
+    numbers = {name: values for name, (values, lost) in read.items() if not too_many(lost, len(values))}
+    lost = {name: lost for name, (_, lost) in read.items() if lost}
     episodes = _episodes(numbers) if prefix is None else prefix
     if episodes is not None:
         ids = episode_numbers(path, table, episodes)
         values, counts = np.unique(ids, return_counts=True)
-        one = episode(table, ids, int(values[np.argmax(counts)]))
-        numbers = {name: values for name, column in one.items() if (values := _numbers(column)) is not None}
+        one = episode({**numbers}, ids, int(values[np.argmax(counts)]))
+        numbers = {name: np.asarray(own, dtype=np.float64) for name, own in one.items()}
     clock = replace(_clock(path, numbers), rate=rate)
-    times = [values for name, values in numbers.items() if leaf(name) == clock.column or name == clock.column]
-    longest = max(times, key=len)
+    longest = max((v for name, v in numbers.items() if clock.column in (name, leaf(name))), key=len)
     seconds = float(longest[-1] - longest[0]) * find_unit(clock.unit).factor
-    rests = {name: float(values[0]) for name, values in numbers.items() if len(values) and (values == values[0]).all()}
-    weights = {name: value for name, value in rests.items() if read_name(leaf(name)).unit == "kg"}
-    return Opened(clock, episodes, _together(numbers, clock, episodes), seconds, weights)
+    weights = {
+        name: float(values[0])
+        for name, values in numbers.items()
+        if len(values) and (values == values[0]).all() and read_name(leaf(name)).unit == "kg"
+    }
+    return Opened(clock, episodes, _together(numbers, clock, episodes), seconds, weights, (), lost)
 
 
 def richest(
@@ -94,15 +98,15 @@ def richest(
 
     That is the one in which most of the first one's columns change: a joint may stand still in one motion of several.
     """
-    names = {*read_table(files[0], (), columns)}
-    opened = [replace(open_table(file, read_table(file, (), columns), rate), names=columns) for file in files]
-    alike = [opened[0], *(one for one in opened[1:] if names.issuperset(one.columns))]
+    tables = [read_table(file, (), columns) for file in files]
+    opened = [replace(open_table(f, t, rate), names=columns) for f, t in zip(files, tables, strict=True)]
+    alike = [opened[0], *(one for one in opened[1:] if {*tables[0]}.issuperset(one.columns))]
     most = max(alike, key=lambda one: len(one.columns))
     return most, [one for one in opened if one is not most]
 
 
-def loads(opened: Sequence[Opened]) -> list[str]:
-    """What is to be asked of columns that say in kg what a log carries, so that it can be given as a fact."""
+def ask_of_columns(opened: Sequence[Opened]) -> list[str]:
+    """What is to be asked of columns that say in kg what a log carries, and of cells that are no numbers."""
     out = []
     for name in sorted({name for one in opened for name in one.weights}):
         values = [one.weights[name] for one in opened if name in one.weights]
@@ -110,114 +114,90 @@ def loads(opened: Sequence[Opened]) -> list[str]:
             span = " to ".join(f"{value:.4g}" for value in sorted({min(values), max(values)}))
             entry = '`added = {"body:NAME.mass" = ...}`'
             out.append(f"{name!r} is {span} kg by log: of a load that the model has not, each log can say it: {entry}")
+    for name in sorted({name for one in opened for name in one.lost}):
+        used = "are read as missing" if any(name in one.columns for one in opened) else "leave nothing of it to be used"
+        count = sum(one.lost.get(name, 0) for one in opened)
+        out.append(f"{name!r}: cells that are no numbers ({count}) {used}; correct the log, or leave such cells blank")
     return out
 
 
-def _numbers(column: np.ndarray) -> FloatArray | None:
-    """A column as numbers; None for text."""
-    if column.dtype.kind in "biuf":
-        return column.astype(np.float64)
-    try:
-        return np.asarray(column, dtype=np.float64) if column.dtype.kind == "O" else None
-    except (TypeError, ValueError):
-        return None
+def leaf(name: str) -> str:
+    """The last part of a column's name, behind topics, structs and folders: a clock is named by it."""
+    return re.split(r"[./](?![^\[]*\])", name)[-1] or name
 
 
 def _episodes(numbers: Mapping[str, FloatArray]) -> str | None:
     """The column that numbers episodes: whole numbers that stay for long, and are more than one."""
     for name, values in numbers.items():
-        if read_name(leaf(name)).kind != Kind.EPISODE or len(values) < 2 or not np.isfinite(values).all():
-            continue
-        distinct = np.unique(values)
-        if (values == np.round(values)).all() and 1 < len(distinct) <= len(values) // 4:
+        whole = read_name(leaf(name)).kind == Kind.EPISODE and bool((values == np.round(values)).all())
+        if whole and 1 < len(np.unique(values)) <= len(values) // 4:
             return name
     return None
 
 
-def leaf(name: str) -> str:
-    """The last part of a column's name, behind topics, structs and folders: a clock is named by it."""
-    depth, start = 0, 0
-    for i, letter in enumerate(name):
-        depth += (letter == "[") - (letter == "]")
-        if letter in "./" and depth == 0:
-            start = i + 1
-    return name[start:] or name
-
-
 def _clock(path: Path, numbers: Mapping[str, FloatArray]) -> Clock:
     """The clock that most columns have, of those the one with the best name."""
-    ranked: dict[str, float] = {}
+    times = {name: values for name, values in numbers.items() if read_name(leaf(name)).kind == Kind.TIME}
+    ranks = {name: _rank(leaf(name), values) for name, values in times.items() if _increases(values)}
+    if ranks:
+        word = leaf(max(ranks, key=ranks.__getitem__))
+        return _timed(word, max((values for name, values in numbers.items() if leaf(name) == word), key=len))
+    for name, values in times.items():
+        steps = np.diff(values) if len(values) > 2 else np.zeros(0)
+        repeats = np.flatnonzero(steps == 0)
+        if (steps >= 0).all() and 0 < len(repeats) < len(values) / 10:
+            raise LogError(
+                f"{path}: {name!r} repeats a time stamp in {len(repeats)} rows, first in row {repeats[0] + 3}; "
+                "leave these rows out"
+            )
     for name, values in numbers.items():
-        word = leaf(name)
-        label = read_name(word)
-        if label.kind != Kind.TIME or not _increases(values):
-            continue
-        rank = 3.0 * (word == "time") + 2.0 * (word in ("t", "timestamp")) + bool(label.unit) - 0.1 * len(label.words)
-        rank += 0.001 * np.log(len(values))
-        step = float(np.median(np.diff(values)))
-        rank -= 4.0 * (step == 1.0 and not label.unit and word not in ("time", "t"))  # a counter of samples
-        ranked[word] = max(ranked.get(word, -np.inf), rank)
-    if not ranked:
-        for name, values in numbers.items():
-            repeats = np.flatnonzero(np.diff(values) == 0) if len(values) > 2 else np.zeros(0)
-            rises = read_name(leaf(name)).kind == Kind.TIME and bool((np.diff(values) >= 0).all())
-            if rises and 0 < len(repeats) < len(values) / 10:
-                raise LogError(
-                    f"{path}: {name!r} repeats a time stamp in {len(repeats)} rows, first in row {repeats[0] + 3}; "
-                    "leave these rows out"
-                )
-        steady = [name for name, values in numbers.items() if _increases(values) and _is_steady(values)]
-        if not steady:
-            has = listed(list(map(repr, numbers)))
-            raise LogError(f"{path}: no column is a clock that increases; it has {has}; give the rows' Hz: --rate 500")
-        name = steady[0]
-        return _timed(leaf(name), numbers[name], f"the only kind of column that rises steadily: {name}", True)
-    word = max(ranked, key=lambda w: ranked[w])
-    longest = max((values for name, values in numbers.items() if leaf(name) == word), key=len)
-    return _timed(word, longest, "", False)
+        steps = np.diff(values)
+        if _increases(values) and np.mean(np.abs(steps - np.median(steps)) > 0.5 * np.median(steps)) < 0.3:
+            return _timed(leaf(name), values, f"the only kind of column that rises steadily: {name}")
+    has = listed(list(map(repr, numbers)))
+    raise LogError(f"{path}: no column is a clock that increases; it has {has}; give the rows' Hz: --rate 500")
 
 
-def _timed(word: str, values: FloatArray, why: str, doubt: bool) -> Clock:
-    period = float(np.median(np.diff(values)))
-    named, sized = read_name(word).unit, time_unit(period)
-    named = named if named in ("s", "ms", "us", "ns") else ""
-    rate = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[named or sized] / period
-    evidence = f"{period:.6g} from row to row, {rate:.4g} Hz"
-    if named and named != sized and period > 0:
+def _rank(word: str, values: FloatArray) -> float:
+    """How good a name of a clock is; one that counts samples is none."""
+    label, counts = read_name(word), float(np.median(np.diff(values))) == 1.0 and word not in ("time", "t")
+    rank = 3.0 * (word == "time") + 2.0 * (word in ("t", "timestamp")) + bool(label.unit) - 0.1 * len(label.words)
+    return rank + 0.001 * float(np.log(len(values))) - 4.0 * (counts and not label.unit)
+
+
+def _timed(word: str, values: FloatArray, why: str = "") -> Clock:
+    """A clock with its unit, by its name or by its step; why: what else is to be doubted."""
+    period, named = float(np.median(np.diff(values))), read_name(word).unit
+    sized, named = time_unit(period), named if named in ("s", "ms", "us", "ns") else ""
+    rate = 1 / (period * find_unit(named or sized).factor)
+    if named and named != sized:
         text = f"its name says {named}, which makes {rate:.3g} Hz; its size speaks for {sized}"
         return Clock(word, named, period, text, text)
-    reason = "as its name says" if named else evidence
-    text = f"{why} is taken for the clock" if doubt else ""
-    return Clock(word, named or sized, period, why or f"{reason}: {evidence}" if named else why or reason, text)
+    reason = "as its name says: " * bool(named) + f"{period:.6g} from row to row, {rate:.4g} Hz"
+    return Clock(word, named or sized, period, why or reason, f"{why} is taken for the clock" if why else "")
 
 
 def _increases(values: FloatArray) -> bool:
     return len(values) > 2 and bool(np.isfinite(values).all() and (np.diff(values) > 0).all())
 
 
-def _is_steady(values: FloatArray) -> bool:
-    steps = np.diff(values)
-    usual = float(np.median(steps))
-    return bool(usual > 0 and np.mean(np.abs(steps - usual) > 0.5 * usual) < _UNLIKE)
-
-
 def _together(numbers: Mapping[str, FloatArray], clock: Clock, episodes: str | None) -> dict[str, FloatArray]:
     """The columns that change, on the clock with most samples: those of other clocks as they are held."""
-    clocks = {name: clock_of(dict(numbers), name, clock.column) for name in numbers}
-    clocks = {name: own for name, own in clocks.items() if own in numbers}
-    usable = {name: numbers[own] for name, own in clocks.items() if 0 <= len(numbers[own]) - len(numbers[name]) <= 1}
-    usable = {name: time for name, time in usable.items() if _increases(time)}
+    times = {name: clock_of(dict(numbers), name, clock.column) for name in numbers}
+    usable = {
+        name: numbers[own]
+        for name, own in times.items()
+        if own in numbers and 0 <= len(numbers[own]) - len(numbers[name]) <= 1 and _increases(numbers[own])
+    }
     if not usable:
         return {}
-    lead = max(usable.values(), key=len)
-    lead = lead[np.unique(np.round(np.linspace(0, min(len(lead), _MOST) - 1, min(len(lead), _MOST))).astype(int))]
+    lead = max(usable.values(), key=len)[:_MOST]
     out: dict[str, FloatArray] = {}
     for name, time in usable.items():
         values = numbers[name]
-        if name in (clocks[name], episodes) or leaf(name) == clock.column or not np.isfinite(values).any():
-            continue
-        values = np.append(values, values[-1:]) if len(values) < len(time) else values
-        rows = np.clip(np.searchsorted(time, lead, side="right") - 1, 0, len(time) - 1)
-        if np.ptp(values[np.isfinite(values)]) > 0:
-            out[name] = values[rows]
+        known = values[np.isfinite(values)]
+        is_clock = name in (times[name], episodes) or leaf(name) == clock.column
+        if not is_clock and known.size and np.ptp(known) > 0:
+            rows = np.searchsorted(time, lead, side="right") - 1
+            out[name] = values[np.clip(rows, 0, len(values) - 1)]
     return out

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.files import LOG_GIB, LineError, limit
 
 if TYPE_CHECKING:
@@ -112,3 +113,30 @@ def plain(values: NDArray[np.generic]) -> NDArray[np.generic]:
     if values.dtype.kind == "M":
         values = np.subtract(values, values[:1])
     return np.divide(values, np.timedelta64(1, "s")) if values.dtype.kind == "m" else values
+
+
+def as_numbers(values: NDArray[np.generic]) -> tuple[FloatArray, int] | None:
+    """A column (n,) as numbers, NaN where a cell is text, and how many cells are; None for a column without numbers.
+
+    Text in more than a tenth of the cells is for the caller to refuse: ``too_many``.
+    """
+    if values.dtype.kind not in "OSU":
+        return (values.astype(np.float64), 0) if values.dtype.kind in "biuf" else None
+    cells = [_number_in(cell) for cell in values]
+    lost = cells.count(None)
+    numbers = np.array([np.nan if cell is None else cell for cell in cells], dtype=np.float64)
+    return None if lost and not np.isfinite(numbers).any() else (numbers, lost)
+
+
+def too_many(lost: int, cells: int) -> bool:
+    """Whether so much of a column is text that these are no cells that a sensor has missed."""
+    return 10 * lost > cells
+
+
+def _number_in(cell: object) -> float | None:
+    """NaN for a blank cell, None for one that is no number."""
+    try:
+        blank = cell is None or str(cell).strip() == ""
+        return np.nan if blank else None if isinstance(cell, complex | np.complexfloating) else float(cell)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return None

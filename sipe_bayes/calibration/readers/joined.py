@@ -19,6 +19,8 @@ JOINTS = "joint_list.txt"
 def read_joined(path: Path, wanted: Collection[str]) -> Columns:
     """The columns of all files, each behind its file's name."""
     names = [line.strip() for line in _names(path).splitlines() if line.strip()]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise LogError(f"{path / JOINTS}: {twice!r} stands in it twice; give each joint a name of its own")
     columns: Columns = {}
     for file in sorted(path.glob("*.csv")):
         own = read_csv(file, ())

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from sipe_bayes.calibration.config import load_config
 from sipe_bayes.calibration.init.draft import Draft
 from sipe_bayes.calibration.init.propose import propose
-from sipe_bayes.calibration.init.tables import loads, richest
+from sipe_bayes.calibration.init.tables import ask_of_columns, richest
 from sipe_bayes.calibration.init.write import summary, toml_of
 from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.cli.app import app
@@ -254,7 +254,29 @@ def test_a_weight_that_logs_state_is_asked_for(tmp_path: Path) -> None:
         columns = {"t": time, "boom": np.sin(time), "payload_kg": weight, "hook_kg": 0.0, "oil": weight}
         pd.DataFrame(columns).to_csv(tmp_path / f"{name}.csv", index=False)
     opened, others = richest([tmp_path / "empty.csv", tmp_path / "loaded.csv"])
-    (doubt,) = loads([opened, *others])
+    (doubt,) = ask_of_columns([opened, *others])
     assert doubt.startswith("'payload_kg' is 0 to 60 kg by log")
     assert "added" in doubt
-    assert loads([opened]) == []
+    assert ask_of_columns([opened]) == []
+
+
+def test_cells_that_are_no_numbers_are_missing_and_counted(tmp_path: Path) -> None:
+    """Also where the configuration is read; a column of words is none."""
+    truth = make_log(tmp_path, KINDS["arm"], 1, 3)
+    table = pd.read_csv(tmp_path / "log.csv").astype(object)
+    column = next(column for column, target in truth.columns if target.endswith(".position"))
+    table.loc[[7, 90, 91], column] = "ERR"
+    table["temp"] = ["ERR", 20.0] * (len(table) // 2) + [20.0] * (len(table) % 2)
+    table["state"] = ["run", "stop"] * (len(table) // 2) + ["stop"] * (len(table) % 2)
+    table.to_csv(tmp_path / "log.csv", index=False)
+    draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
+    assert wrong(draft, truth) == []
+    missing, unused = sorted(doubt for doubt in draft.open_doubts if "no numbers" in doubt)
+    assert unused.startswith("'temp'")
+    assert "leave nothing of it to be used" in unused
+    remedy = "correct the log, or leave such cells blank"
+    assert missing == f"{column!r}: cells that are no numbers (3) are read as missing; {remedy}"
+    (tmp_path / "calibrate.toml").write_text(toml_of(draft, "sipe init"))
+    config = load_config(tmp_path / "calibrate.toml")
+    trajectory, _ = load_log(config, config.logs[0])
+    assert np.isfinite(trajectory.observations).mean() > 0.9

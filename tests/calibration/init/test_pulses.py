@@ -12,10 +12,10 @@ import pytest
 from sipe_bayes.calibration.column_names import read_name
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.readings import _pulse
+from sipe_bayes.calibration.init.validate import validate_config
 from sipe_bayes.calibration.init.write import toml_of
 from sipe_bayes.calibration.machine import Machine
 from sipe_bayes.calibration.problem import prepare
-from sipe_bayes.calibration.validate import validate_config
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import MjcfEnvironment

@@ -52,6 +52,13 @@ def test_lists_have_names_where_there_are_as_many(tmp_path: Path) -> None:
         read_table(root)
 
 
+def test_a_name_that_stands_twice_in_a_list_of_joints(tmp_path: Path) -> None:
+    root = joined_folder(tmp_path, regular(200)).path
+    (root / "joint_list.txt").write_text("Pan\nPan\n")
+    with pytest.raises(LogError, match=r"joint_list.txt: 'Pan' stands in it twice; give each joint a name of its own"):
+        read_table(root)
+
+
 def test_a_folder_of_motions_is_matched_by_the_order_of_its_joints(tmp_path: Path) -> None:
     for motion in ("one", "two"):
         (tmp_path / "raw").mkdir(exist_ok=True)
