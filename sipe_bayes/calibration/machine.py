@@ -7,13 +7,14 @@ from enum import Enum
 
 import mujoco
 import numpy as np
+from mujoco import mjtJoint, mjtTrn
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.envs.kinds.tendons import tendon_arms
 from sipe_bayes.envs.laws.bound import is_of_law
 
-_GRAVITY, _BRISK = 9.81, 10.0  # m/s^2, rad/s^2 or m/s^2: motions of unknown machines
-_NO_MASS = 0.01  # of all that a body carries
+_BRISK = 10.0  # rad/s^2 or m/s^2: of motions that are not known
+_SCALAR = (int(mjtJoint.mjJNT_HINGE), int(mjtJoint.mjJNT_SLIDE))
 
 
 class Drive(Enum):
@@ -24,13 +25,6 @@ class Drive(Enum):
     VELOCITY = "a set-point of the velocity"
     VOLTAGE = "a voltage"
     OTHER = "a command"
-
-
-_INPUTS = {
-    int(mujoco.mjtCtrlInput.mjINPUT_POS): Drive.POSITION,
-    int(mujoco.mjtCtrlInput.mjINPUT_VEL): Drive.VELOCITY,
-    int(mujoco.mjtCtrlInput.mjINPUT_VOLTAGE): Drive.VOLTAGE,
-}
 
 
 @dataclass(frozen=True)
@@ -95,41 +89,30 @@ class Machine:
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> Machine:
-        """Read a compiled model."""
-        scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-        named = [i for i in range(model.njnt) if int(model.jnt_type[i]) in scalar and model.joint(i).name]
-        of_base = base_joints(model)
-        joints = [
-            Joint(
-                model.joint(i).name,
-                model.body(int(model.jnt_bodyid[i])).name,
-                int(model.jnt_type[i]) == scalar[0],
-                k,
-                i in of_base,
-                (float(model.jnt_range[i, 0]), float(model.jnt_range[i, 1])) if model.jnt_limited[i] else None,
-            )
-            for k, i in enumerate(named)
-        ]
-        by_id = dict(zip(named, joints, strict=True))
-        actuators = [
-            Actuator(
-                model.actuator(i).name,
-                drive_of(model, i),
-                by_id.get(_joint_of(model, i)),
-                k,
-                full_of(model, i),
-                _limits_of(model, i),
-                int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON),
-                _is_thrust(model, i),
-                _is_thrust(model, i) and _is_free(model, i),
-            )
-            for k, i in enumerate(_commanded(model))
-        ]
-        free = [i for i in range(model.njnt) if int(model.jnt_type[i]) not in scalar]
-        bodies = [model.body(int(model.jnt_bodyid[i])).name for i in free]
+        """Read a compiled model: its hinges and slides with a name, and its actuators with a name that are no law's."""
+        owners = [model.body(int(body)).name for body in model.jnt_bodyid]
+        named = [j for j in range(model.njnt) if model.jnt_type[j] in _SCALAR and model.joint(j).name]
+        of_base, joints = base_joints(model), dict[int, Joint]()
+        for rank, j in enumerate(named):
+            reach = (float(model.jnt_range[j, 0]), float(model.jnt_range[j, 1])) if model.jnt_limited[j] else None
+            hinge = bool(model.jnt_type[j] == mjtJoint.mjJNT_HINGE)
+            joints[j] = Joint(model.joint(j).name, owners[j], hinge, rank, j in of_base, reach)
+        driving = [i for i in range(model.nu) if (name := model.actuator(i).name) and not is_of_law(name)]
+        actuators = []
+        for rank, i in enumerate(driving):
+            low, high = model.actuator_ctrlrange[i].tolist()
+            limits = (low, high) if model.actuator_ctrllimited[i] else None
+            tendon, thrust = bool(model.actuator_trntype[i] == mjtTrn.mjTRN_TENDON), _is_thrust(model, i)
+            owner = int(model.body_weldid[model.site_bodyid[model.actuator_trnid[i, 0]]]) if thrust else 0
+            first = int(model.body_jntadr[owner])
+            flies = thrust and first >= 0 and bool(model.jnt_type[first] == mjtJoint.mjJNT_FREE)
+            moved, drive = joints.get(_joint_of(model, i)), drive_of(model, i)
+            parts = (full_of(model, i), limits, tendon, thrust, flies)
+            actuators.append(Actuator(model.actuator(i).name, drive, moved, rank, *parts))
+        bodies = [owners[j] for j in range(model.njnt) if model.jnt_type[j] not in _SCALAR and owners[j]]
         kinds = {int(mujoco.mjtSensor.mjSENS_GYRO): "gyro", int(mujoco.mjtSensor.mjSENS_ACCELEROMETER): "accelerometer"}
         sensors = [(model.sensor(i).name, kinds.get(int(model.sensor_type[i]), "")) for i in range(model.nsensor)]
-        return cls(tuple(joints), tuple(actuators), tuple(b for b in bodies if b), tuple(s for s in sensors if s[1]))
+        return cls(tuple(joints.values()), tuple(actuators), tuple(bodies), tuple(s for s in sensors if s[1]))
 
 
 @dataclass(frozen=True)
@@ -148,41 +131,41 @@ class Sizes:
         cls, model: mujoco.MjModel, machine: Machine, states: FloatArray | None, controls: FloatArray | None
     ) -> Sizes:
         """Read from states (n, S) and controls (n, nu) of the logs; from the model alone where there are none."""
-        data = mujoco.MjData(model)
+        data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
         forces, speeds, inertias = [], [], []
-        rows = 1 if states is None else len(states)
-        for k in range(rows):
+        for k in range(1 if states is None else len(states)):
             if states is not None:
-                data.qpos[:] = states[k, 1 : 1 + model.nq]
-                data.qvel[:] = states[k, 1 + model.nq : 1 + model.nq + model.nv]
+                data.qpos[:], data.qvel[:] = np.split(states[k, 1 : 1 + model.nq + model.nv], [model.nq])
             if controls is not None:
                 data.ctrl[:] = controls[k]
             mujoco.mj_forward(model, data)
-            full = np.zeros((model.nv, model.nv))
             mujoco.mj_fullM(model, data, full)
-            inertia = np.diag(full).copy()
-            speed = np.abs(data.qvel.copy())
-            moving = _BRISK * inertia if states is None else np.zeros(model.nv)
-            gravity = np.abs(data.qfrc_bias) + (0.5 * _GRAVITY * np.sqrt(inertia) if states is None else 0.0)
-            arms = tendon_arms(model, data)
-            carried = _carried(full, arms)
-            pulls = _pulls(model, data) + (_BRISK * carried if states is None else 0.0)
-            forces.append([*(np.abs(data.qfrc_actuator) + gravity + moving), *pulls])
-            usual = np.full(model.nv, 3.0)
-            speeds.append(
-                [*speed, *np.abs(arms @ data.qvel)] if states is not None else [*usual, *np.abs(arms) @ usual]
-            )
+            arms, inertia = tendon_arms(model, data), np.diag(full)
+            yielding = np.einsum("tv,vt->t", arms, np.linalg.solve(full, arms.T)) if len(arms) else np.zeros(0)
+            carried = np.divide(1.0, yielding, out=np.zeros(len(arms)), where=yielding > 0)  # at the tendon's end
             inertias.append([*inertia, *carried])
-        force, speed = np.quantile(forces, 0.9, axis=0), np.quantile(speeds, 0.9, axis=0)
-        inertia = np.mean(inertias, axis=0)
+            velocity = np.full(model.nv, 3.0) if states is None else data.qvel
+            speeds.append(np.abs([*velocity, *((np.abs(arms) if states is None else arms) @ velocity)]))
+            force = np.abs([*data.qfrc_actuator, *_pulls(model, data)])
+            force[: model.nv] += np.abs(data.qfrc_bias)
+            if states is None:
+                force[: model.nv] += 0.5 * 9.81 * np.sqrt(inertia)
+                force += _BRISK * np.array(inertias[-1])
+            forces.append(force)
+        sizes = np.quantile(forces, 0.9, axis=0), np.quantile(speeds, 0.9, axis=0), np.mean(inertias, axis=0)
         at = {joint.name: int(model.joint(joint.name).dofadr[0]) for joint in machine.joints}
-        moved = [t for t in range(model.ntendon) if inertia[model.nv + t] > 0]
+        moved = [t for t in range(model.ntendon) if sizes[2][model.nv + t] > 0]
         at |= {f"tendon:{model.tendon(t).name}": model.nv + t for t in moved}
+        least = zip(sizes, (1e-9, 1e-3, 1e-12), strict=True)
+        return cls(*({name: max(float(values[i]), low) for name, i in at.items()} for values, low in least))
 
-        def by_name(values: FloatArray, least: float) -> dict[str, float]:
-            return {name: max(float(values[i]), least) for name, i in at.items()}
 
-        return cls(by_name(force, 1e-9), by_name(speed, 1e-3), by_name(inertia, 1e-12))
+def _pulls(model: mujoco.MjModel, data: mujoco.MjData) -> FloatArray:
+    """What actuators and its own spring pull at each tendon (ntendon,), as sizes."""
+    pulls = model.tendon_stiffness * np.abs(data.ten_length - np.clip(data.ten_length, *model.tendon_lengthspring.T))
+    at = model.actuator_trntype == mjtTrn.mjTRN_TENDON
+    np.add.at(pulls, model.actuator_trnid[at, 0], np.abs(data.actuator_force * model.actuator_gear[:, 0])[at])
+    return np.asarray(pulls)
 
 
 def base_joints(model: mujoco.MjModel) -> dict[int, int]:
@@ -192,23 +175,24 @@ def base_joints(model: mujoco.MjModel) -> dict[int, int]:
     sprung or rubs in the model, where actuators move joints of what it carries.
     """
     driven = {_joint_of(model, i) for i in range(model.nu)}
+    weighs = model.body_mass > 0.01 * model.body_subtreemass  # unlike what bodies get that only hold joints apart
+    dof = model.jnt_dofadr
+    resists = model.jnt_stiffness + model.dof_damping[dof] + model.dof_frictionloss[dof] + model.dof_armature[dof] > 0
     out: dict[int, int] = {}
     for body in range(1, model.nbody):
         above = _above(model, body)
-        if any(_has_mass(model, b) for b in above) or not _has_mass(model, body):
-            continue
-        joints = [j for j in range(model.njnt) if int(model.jnt_bodyid[j]) in (body, *above)]
-        slides = sum(int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_SLIDE) for j in joints)
-        held = any(j in driven or _resists(model, j) for j in joints)
-        if slides >= 2 and not held and _carries_motors(model, body):
+        joints = [j for j in range(model.njnt) if model.jnt_bodyid[j] in (body, *above)]
+        first = weighs[body] and not weighs[above].any()
+        held = any(j in driven or resists[j] for j in joints)
+        slides = int(np.sum(model.jnt_type[joints] == mjtJoint.mjJNT_SLIDE))
+        if first and slides >= 2 and not held and _carries_motors(model, body):
             out |= dict.fromkeys(joints, body)
     return out
 
 
 def bases(model: mujoco.MjModel) -> set[int]:
     """Ids of the bodies that nothing holds and that carry what actuators move: of rovers, walkers, drones with arms."""
-    free = [j for j in range(model.njnt) if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE)]
-    loose = {int(model.jnt_bodyid[j]) for j in free}
+    loose = {int(body) for body in model.jnt_bodyid[model.jnt_type == mjtJoint.mjJNT_FREE]}
     return {body for body in loose if _carries_motors(model, body)} | set(base_joints(model).values())
 
 
@@ -219,69 +203,29 @@ def _carries_motors(model: mujoco.MjModel, body: int) -> bool:
 
 def _above(model: mujoco.MjModel, body: int) -> list[int]:
     """The bodies that carry a body, without the world."""
-    out, parent = list[int](), int(model.body_parentid[body])
-    while parent:
-        out.append(parent)
-        parent = int(model.body_parentid[parent])
-    return out
-
-
-def _has_mass(model: mujoco.MjModel, body: int) -> bool:
-    """Whether it weighs more than what bodies get that only hold joints apart."""
-    return float(model.body_mass[body]) > _NO_MASS * float(model.body_subtreemass[body])
-
-
-def _resists(model: mujoco.MjModel, joint: int) -> bool:
-    dof = int(model.jnt_dofadr[joint])
-    fields = (model.dof_damping, model.dof_frictionloss, model.dof_armature)
-    return bool(model.jnt_stiffness[joint]) or any(bool(field[dof]) for field in fields)
-
-
-def _carried(inertia: FloatArray, arms: FloatArray) -> FloatArray:
-    """What each tendon moves as a mass at its end, of joints' inertia (nv, nv); 0 of those that nothing moves."""
-    yielding = np.einsum("tv,vt->t", arms, np.linalg.solve(inertia, arms.T)) if len(arms) else np.zeros(0)
-    return np.divide(1.0, yielding, out=np.zeros(len(arms)), where=yielding > 0)
-
-
-def _pulls(model: mujoco.MjModel, data: mujoco.MjData) -> FloatArray:
-    """What actuators and its own spring pull at each tendon (ntendon,), as sizes."""
-    pulls = model.tendon_stiffness * np.abs(data.ten_length - np.clip(data.ten_length, *model.tendon_lengthspring.T))
-    at = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
-    np.add.at(pulls, model.actuator_trnid[at, 0], np.abs(data.actuator_force * model.actuator_gear[:, 0])[at])
-    return np.asarray(pulls)
-
-
-def _commanded(model: mujoco.MjModel) -> list[int]:
-    """Actuators with a name, of no law."""
-    names = [model.actuator(i).name for i in range(model.nu)]
-    return [i for i, name in enumerate(names) if name and not is_of_law(name)]
+    parent = int(model.body_parentid[body])
+    return [parent, *_above(model, parent)] if parent else []
 
 
 def _is_thrust(model: mujoco.MjModel, index: int) -> bool:
     """Whether an actuator pushes a body at a site of it, in no other site's axes."""
-    if int(model.actuator_trntype[index]) != int(mujoco.mjtTrn.mjTRN_SITE) or model.actuator_trnid[index, 1] >= 0:
-        return False
-    return bool(model.actuator_gear[index, :3].any())
-
-
-def _is_free(model: mujoco.MjModel, index: int) -> bool:
-    """Whether the body of an actuator's site moves freely."""
-    body = int(model.body_weldid[model.site_bodyid[model.actuator_trnid[index, 0]]])
-    joint = int(model.body_jntadr[body])
-    return joint >= 0 and int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE)
+    at_site = model.actuator_trntype[index] == mjtTrn.mjTRN_SITE and model.actuator_trnid[index, 1] < 0
+    return bool(at_site and model.actuator_gear[index, :3].any())
 
 
 def drive_of(model: mujoco.MjModel, index: int) -> Drive:
     """What an actuator of a compiled model is given."""
-    kind, inputs = int(model.actuator_gaintype[index]), int(model.actuator_ctrlspec[index])
-    if kind in (int(mujoco.mjtGain.mjGAIN_DCMOTOR), int(mujoco.mjtGain.mjGAIN_PID)):
-        return _INPUTS.get(inputs, Drive.OTHER)
-    if int(model.actuator_gaintype[index]) != int(mujoco.mjtGain.mjGAIN_FIXED):
+    kind, inputs = int(model.actuator_gaintype[index]), mujoco.mjtCtrlInput
+    if kind in (mujoco.mjtGain.mjGAIN_DCMOTOR, mujoco.mjtGain.mjGAIN_PID):
+        given = {int(inputs.mjINPUT_POS): Drive.POSITION, int(inputs.mjINPUT_VEL): Drive.VELOCITY}
+        given[int(inputs.mjINPUT_VOLTAGE)] = Drive.VOLTAGE
+        return given.get(int(model.actuator_ctrlspec[index]), Drive.OTHER)
+    if kind != mujoco.mjtGain.mjGAIN_FIXED:
         return Drive.OTHER
-    if int(model.actuator_biastype[index]) == int(mujoco.mjtBias.mjBIAS_NONE):
+    if model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_NONE:
         return Drive.FORCE
     gain, (_, of_position, of_velocity) = float(model.actuator_gainprm[index, 0]), model.actuator_biasprm[index, :3]
-    if int(model.actuator_dyntype[index]) == int(mujoco.mjtDyn.mjDYN_INTEGRATOR):  # <intvelocity>
+    if model.actuator_dyntype[index] == mujoco.mjtDyn.mjDYN_INTEGRATOR:  # <intvelocity>
         return Drive.VELOCITY if of_position else Drive.OTHER
     if of_position:
         return Drive.POSITION
@@ -297,34 +241,26 @@ def full_of(model: mujoco.MjModel, index: int) -> float | None:
     return float(high) if even else None
 
 
-def _limits_of(model: mujoco.MjModel, index: int) -> tuple[float, float] | None:
-    low, high = model.actuator_ctrlrange[index].tolist()
-    return (low, high) if model.actuator_ctrllimited[index] else None
-
-
 def _joint_of(model: mujoco.MjModel, index: int) -> int:
     """The joint that an actuator moves, itself or by its tendon's first; -1 for none, and for tendons through sites."""
     kind, at = int(model.actuator_trntype[index]), int(model.actuator_trnid[index, 0])
-    if kind == int(mujoco.mjtTrn.mjTRN_TENDON):
+    if kind == mjtTrn.mjTRN_TENDON:
         first = model.tendon_adr[at]
-        by_joints = int(model.wrap_type[first]) == int(mujoco.mjtWrap.mjWRAP_JOINT)
-        return int(model.wrap_objid[first]) if by_joints else -1
-    return at if kind in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)) else -1
+        return int(model.wrap_objid[first]) if model.wrap_type[first] == mujoco.mjtWrap.mjWRAP_JOINT else -1
+    return at if kind in (mjtTrn.mjTRN_JOINT, mjtTrn.mjTRN_JOINTINPARENT) else -1
 
 
 def top_of(model: mujoco.MjModel, geom: int, tops: set[int]) -> int:
     """The free body that a geom moves with; 0 for none."""
-    body, top = int(model.geom_bodyid[geom]), 0
-    while body:
-        top, body = (body if body in tops else top), int(model.body_parentid[body])
-    return top
+    body = int(model.geom_bodyid[geom])
+    return next((one for one in reversed([body, *_above(model, body)]) if one in tops), 0)
 
 
 def touched_by(model: mujoco.MjModel, geom: int) -> list[int]:
     """The geoms that stand still and that a geom may touch."""
     kinds, with_kinds = model.geom_contype, model.geom_conaffinity
     meets = (kinds[geom] & with_kinds) | (kinds & with_kinds[geom])
-    return [g for g in range(model.ngeom) if meets[g] and int(model.body_weldid[model.geom_bodyid[g]]) == 0]
+    return np.flatnonzero((meets != 0) & (model.body_weldid[model.geom_bodyid] == 0)).tolist()
 
 
 def touching_bodies(model: mujoco.MjModel, states: FloatArray) -> set[int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,11 +10,9 @@ from sipe_bayes.core.arrays import FloatArray
 
 _FEWEST = 20  # samples from which anything is said
 _LATEST = 25  # samples that a column may lag behind another
-_JUMP = 0.8  # of a turn, from one sample to the next
 
 
-@dataclass(frozen=True)
-class Slope:
+class Slope(NamedTuple):
     """How one column (n,) follows another's slope.
 
     Args:
@@ -26,6 +24,13 @@ class Slope:
     factor: float
     share: float
     lag: float
+
+
+class Likeness(NamedTuple):
+    """How a command (n,) follows a measurement: value = factor * measurement, and the share of variance."""
+
+    factor: float
+    share: float
 
 
 def slope_of(position: FloatArray, velocity: FloatArray, dt: float = 1.0) -> Slope:
@@ -45,18 +50,26 @@ def slope_of(position: FloatArray, velocity: FloatArray, dt: float = 1.0) -> Slo
     way = (position[span:] - position[:-span]) / (span * dt)
     total = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]))])
     mean = (total[span:] - total[:-span]) / span
-    reach = min(_LATEST, len(way) // 4)
-    shares = np.array([_explained(way, mean, lag) for lag in range(-2, reach + 1)])
+    shares = np.array([_explained(way, mean, lag) for lag in range(-2, min(_LATEST, len(way) // 4) + 1)])
     best = int(np.argmax(shares))
-    share, lag = float(shares[best]), float(best - 2)
-    if 0 < best < len(shares) - 1:
-        below, above = shares[best - 1], shares[best + 1]
-        bend = below - 2 * share + above
-        lag += 0.5 * (below - above) / bend if bend < 0 else 0.0
+    lag = float(best - 2)
+    if 0 < best < len(shares) - 1 and (bend := shares[best - 1] - 2 * shares[best] + shares[best + 1]) < 0:
+        lag += 0.5 * (shares[best - 1] - shares[best + 1]) / bend
     a, b = _shifted(way, mean, best - 2)
     # the geometric mean of both regressions, so that noise of either does not shrink it
     factor = float(np.sign(a @ b) * np.sqrt((a @ a) / max(float(b @ b), 1e-300))) or 1.0
-    return Slope(factor, share, lag)
+    return Slope(factor, float(shares[best]), lag)
+
+
+def likeness(command: FloatArray, measured: FloatArray) -> Likeness:
+    """Whether a command (n,) looks like a measurement (n,) that comes later."""
+    known = np.isfinite(command) & np.isfinite(measured)
+    a, b = command[known], measured[known]
+    if len(a) < _FEWEST or np.ptp(a) == 0 or np.ptp(b) == 0:
+        return Likeness(1.0, 0.0)
+    shares = [_explained(a, b, lag) for lag in range(min(_LATEST, len(a) // 4))]
+    x, y = _shifted(a, b, best := int(np.argmax(shares)))
+    return Likeness(float(x @ y) / max(float(y @ y), 1e-300), float(shares[best]))
 
 
 def _shifted(way: FloatArray, mean: FloatArray, lag: int) -> tuple[FloatArray, FloatArray]:
@@ -73,14 +86,10 @@ def _explained(way: FloatArray, mean: FloatArray, lag: int) -> float:
 def turn_of(values: FloatArray) -> float:
     """The turn by which a column (n,) jumps where its angle wraps round, in its own unit; 0 where it never does."""
     finite = values[np.isfinite(values)]
-    if len(finite) < _FEWEST:
-        return 0.0
-    steps = np.abs(np.diff(finite))
+    steps, span = np.abs(np.diff(finite)), np.ptp(finite) if len(finite) >= _FEWEST else 0.0
     for turn in (360.0, 2 * np.pi, 1.0):
-        jumps = steps > _JUMP * turn
-        usual = np.quantile(steps, 0.9) < 0.25 * turn
-        inside = np.ptp(finite) <= 1.02 * turn and np.ptp(finite) > 0.9 * turn
-        if jumps.any() and usual and inside:
+        inside = 0.9 * turn < span <= 1.02 * turn
+        if inside and (steps > 0.8 * turn).any() and np.quantile(steps, 0.9) < 0.25 * turn:
             return turn
     return 0.0
 
@@ -94,32 +103,11 @@ def white_share(values: FloatArray) -> float:
     if len(finite) < 8 * _FEWEST:
         return 1.0
     bent = np.diff(finite, 2)  # takes the motion down; whitened below
-    power = np.abs(np.fft.rfft(bent * np.hanning(len(bent)))) ** 2
-    frequency = np.linspace(0, np.pi, len(power))
-    power = power[1:] / (2 - 2 * np.cos(frequency[1:])) ** 2
+    power = np.abs(np.fft.rfft(bent * np.hanning(len(bent)))[1:]) ** 2
+    power /= (2 - 2 * np.cos(np.linspace(0, np.pi, len(power) + 1)[1:])) ** 2
     quarter = len(power) // 4
     high, low = power[3 * quarter :].mean(), power[2 * quarter : 3 * quarter].mean()
     return float(high / low) if low > 0 else 1.0
-
-
-@dataclass(frozen=True)
-class Likeness:
-    """How a command (n,) follows a measurement: value = factor * measurement, share of variance, samples ahead."""
-
-    factor: float
-    share: float
-
-
-def likeness(command: FloatArray, measured: FloatArray) -> Likeness:
-    """Whether a command looks like a measurement that comes later."""
-    known = np.isfinite(command) & np.isfinite(measured)
-    a, b = command[known], measured[known]
-    if len(a) < _FEWEST or np.ptp(a) == 0 or np.ptp(b) == 0:
-        return Likeness(1.0, 0.0)
-    shares = [_explained(a, b, lag) for lag in range(min(_LATEST, len(a) // 4))]
-    best = int(np.argmax(shares))
-    x, y = _shifted(a, b, best)
-    return Likeness(float(x @ y) / max(float(y @ y), 1e-300), float(shares[best]))
 
 
 def time_unit(period: float) -> str:
