@@ -46,33 +46,19 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Label:
-    """What a column's name says.
-
-    Args:
-        column: the name.
-        kind: of quantity.
-        words: of the name, without numbers, units and words of the quantity.
-        number: the last one in it.
-        stem: the name without that number; columns of one stem are a family.
-        unit: unit word; "" where it names none.
-        angular: whether it speaks of an angle; None where it says nothing.
-        axis: "x", "y", "z" or "w".
-        vector: the name without that axis; columns of one are its components.
-        measured: whether it says so, as in ``tau_measured``.
-        commanded: whether it says so, as in ``tau_cmd``.
-    """
+    """What a column's name says."""
 
     column: str
     kind: Kind
-    words: tuple[str, ...]
-    number: int | None
-    stem: str
-    unit: str = ""
-    angular: bool | None = None
-    axis: str = ""
-    vector: str = ""
-    measured: bool = False
-    commanded: bool = False
+    words: tuple[str, ...]  # of the name, without numbers, units and words of the quantity
+    number: int | None  # the last one in it
+    stem: str  # the name without that number; columns of one stem are a family
+    unit: str = ""  # unit word; "" where it names none
+    angular: bool | None = None  # whether it speaks of an angle; None where it says nothing
+    axis: str = ""  # "x", "y", "z" or "w"
+    vector: str = ""  # the name without that axis; columns of one are its components
+    measured: bool = False  # whether it says so, as in tau_measured
+    commanded: bool = False  # likewise, as in tau_cmd
 
 
 _UNITS = (*UNITS, "bar", "mbar", "Pa", "kPa", "MPa")

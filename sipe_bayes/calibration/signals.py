@@ -13,17 +13,11 @@ _LATEST = 25  # samples that a column may lag behind another
 
 
 class Slope(NamedTuple):
-    """How one column (n,) follows another's slope.
+    """How one column (n,) follows another's slope."""
 
-    Args:
-        factor: of the other's slope in this one's terms: value = slope / factor.
-        share: of its variance that the slope explains.
-        lag: samples by which it is late.
-    """
-
-    factor: float
-    share: float
-    lag: float
+    factor: float  # of the other's slope in this one's terms: value = slope / factor
+    share: float  # of its variance that the slope explains
+    lag: float  # samples by which it is late
 
 
 class Likeness(NamedTuple):

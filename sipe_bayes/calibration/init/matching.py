@@ -77,29 +77,22 @@ class _Target:
 
 _NEVER = -1.0  # a score up to which a column is not taken for a target
 _CALLED = 0.65  # how alike a column and a part are, from which it is called after it
-_TENDONS = 0.3  # the same of a tendon's actuator
 _NATURAL, _BY_NAME = 10.0, 4.0  # what each column counts that is taken for a target by its kind, by its name alone
-_RIVAL = 3.0  # by which a column for a command may fit worse than the chosen one and still be named
-_SLOPE = 0.8  # share of variance from which a column is another's slope
-_FITS: dict[Drive | str, dict[Kind, float]] = {
+_FITS: dict[Drive | str, dict[Kind, float]] = {  # how well kinds of columns fit what an actuator or joint has
     "position": {Kind.POSITION: 0.0},
     "velocity": {Kind.VELOCITY: 0.0},
     "force": {Kind.TORQUE: 0.0},
-    Drive.FORCE: {
-        Kind.TORQUE: 0.4, Kind.COMMAND: 0.0, Kind.CURRENT: -0.6, Kind.VOLTAGE: -0.8, Kind.DUTY: -0.9,
-        Kind.SETPOINT: -2.3,
-    },
     Drive.POSITION: {Kind.SETPOINT: 0.4, Kind.COMMAND: 0.0},
     Drive.VELOCITY: {Kind.SPEED_SETPOINT: 0.4, Kind.COMMAND: 0.0, Kind.SETPOINT: -2.3},
-    Drive.VOLTAGE: {
-        Kind.VOLTAGE: 0.4, Kind.DUTY: 0.2, Kind.COMMAND: 0.0, Kind.CURRENT: -2.1, Kind.TORQUE: -2.3,
-        Kind.SETPOINT: -2.4,
-    },
-    Drive.OTHER: {
-        Kind.COMMAND: 0.4, Kind.DUTY: 0.2, Kind.SETPOINT: -0.2, Kind.TORQUE: -0.6, Kind.VOLTAGE: -0.6,
-        Kind.CURRENT: -1.1,
-    },
-}  # fmt: skip
+    Drive.FORCE: {Kind.TORQUE: 0.4, Kind.COMMAND: 0.0, Kind.CURRENT: -0.6, Kind.VOLTAGE: -0.8, Kind.DUTY: -0.9},
+    Drive.VOLTAGE: {Kind.VOLTAGE: 0.4, Kind.DUTY: 0.2, Kind.COMMAND: 0.0, Kind.CURRENT: -2.1, Kind.TORQUE: -2.3},
+    Drive.OTHER: {Kind.COMMAND: 0.4, Kind.DUTY: 0.2, Kind.TORQUE: -0.6, Kind.VOLTAGE: -0.6, Kind.CURRENT: -1.1},
+}
+_FITS[Drive.FORCE][Kind.SETPOINT], _FITS[Drive.VOLTAGE][Kind.SETPOINT], _FITS[Drive.OTHER][Kind.SETPOINT] = (
+    -2.3,
+    -2.4,
+    -0.2,
+)
 _BECOMES = {Kind.UNKNOWN: Kind.COMMAND, Kind.POSITION: Kind.SETPOINT, Kind.VELOCITY: Kind.SPEED_SETPOINT}
 _DRIVING = {Kind.COMMAND, Kind.SETPOINT, Kind.SPEED_SETPOINT, Kind.TORQUE, Kind.DUTY}
 
@@ -208,11 +201,8 @@ def _assigned(machine: Machine, labels: Sequence[Label], targets: Sequence[_Targ
         surety, named = _sure(x, targets, scores, i, j), alike(x.words, *t.names) > 0
         matches.append(Match((x.column,), t.name, x, surety, named=named))
         for k in np.argsort(-scores[:, j]) if targets[j].drive else ():
-            if (
-                k not in taken_rows
-                and kinds[k][j] == labels[k].kind
-                and scores[k, j] > max(scores[i, j] - _RIVAL, -0.5)
-            ):
+            rival = k not in taken_rows and kinds[k][j] == labels[k].kind
+            if rival and scores[k, j] > max(scores[i, j] - 3.0, -0.5):
                 rivals.append(Match((labels[k].column,), targets[j].name, labels[k], float(scores[k, j])))
     return matches, rivals
 
@@ -248,14 +238,10 @@ def _taken_as(machine: Machine, label: Label, target: _Target) -> Kind | None:
 def _places(labels: Sequence[Label]) -> dict[str, int]:
     """Of a column with a number, its place within its family, counted from 0."""
     families: dict[str, set[int]] = defaultdict(set)
-    for label in labels:
-        if label.number is not None:
-            families[label.stem].add(label.number)
-    return {
-        x.column: sorted(families[x.stem]).index(x.number)
-        for x in labels
-        if x.number is not None and len(families[x.stem]) > 1
-    }
+    numbered = [(x, x.number) for x in labels if x.number is not None]
+    for x, number in numbered:
+        families[x.stem].add(number)
+    return {x.column: sorted(family).index(n) for x, n in numbered if len(family := families[x.stem]) > 1}
 
 
 def _affinity(label: Label, target: _Target, place: int | None, count: int) -> float:
@@ -318,8 +304,7 @@ def _without_tendons(machine: Machine, labels: list[Label]) -> tuple[list[Label]
     away = [
         x.column
         for x in labels
-        if x.kind in (Kind.POSITION, Kind.VELOCITY)
-        and alike(x.words, *pulling) > max(alike(x.words, *joints), _TENDONS)
+        if x.kind in (Kind.POSITION, Kind.VELOCITY) and alike(x.words, *pulling) > max(alike(x.words, *joints), 0.3)
     ]
     which = ", ".join(map(repr, sorted(away)))
     doubt = f"{which}: called as what pulls a tendon, and no joint's; a <tendonpos> of the MJCF may be their target"
@@ -360,22 +345,19 @@ def _loose(family: Sequence[Label], places: Sequence[str], table: Table) -> list
     """A column is a velocity where it is the slope of a position, or of another one of them, which then is one."""
 
     def follows(position: str, velocity: str) -> bool:
-        return slope_of(table[position], table[velocity]).share > _SLOPE
+        return slope_of(table[position], table[velocity]).share > 0.8
 
-    out = []
-    for column in (x.column for x in family):
+    def kind_of(column: str) -> Kind:
         others = [] if places else [x.column for x in family if x.column != column]
-        kind = Kind.OTHER
         if any(follows(place, column) for place in places):
-            kind = Kind.VELOCITY
-        elif column.lower().rstrip("0123456789").endswith("d"):
-            kind = Kind.SETPOINT  # q_d that is no slope: desired
-        elif any(follows(column, other) for other in others):
-            kind = Kind.POSITION
-        elif any(follows(other, column) for other in others):
-            kind = Kind.VELOCITY
-        out.append(kind)
-    return out
+            return Kind.VELOCITY
+        if column.lower().rstrip("0123456789").endswith("d"):
+            return Kind.SETPOINT  # q_d that is no slope: desired
+        if any(follows(column, other) for other in others):
+            return Kind.POSITION
+        return Kind.VELOCITY if any(follows(other, column) for other in others) else Kind.OTHER
+
+    return [kind_of(x.column) for x in family]
 
 
 def _driving(

@@ -25,23 +25,14 @@ _MOST = 20_000  # rows that are looked at
 
 @dataclass(frozen=True)
 class Clock:
-    """The column that holds the clock.
+    """The column that holds the clock."""
 
-    Args:
-        column: as ``columns.time.column`` has it.
-        unit: its unit word.
-        period: its usual step, in its own unit.
-        why: what tells the unit.
-        doubt: what does not; "" for nothing.
-        rate: Hz, of a log without a clock.
-    """
-
-    column: str
-    unit: str
-    period: float
-    why: str
-    doubt: str = ""
-    rate: float | None = None
+    column: str  # as ``columns.time.column`` has it
+    unit: str  # unit word
+    period: float  # its usual step, in its own unit
+    why: str  # what tells the unit
+    doubt: str = ""  # what does not; "" for nothing
+    rate: float | None = None  # Hz, of a log without a clock
 
     @property
     def row(self) -> dict[str, object]:
@@ -51,19 +42,15 @@ class Clock:
 
 @dataclass(frozen=True)
 class Opened:
-    """A log: its clock, what numbers its episodes, its columns (n,) on one clock, and how long it is in s.
-
-    Columns that do not change are none of these; of those in kg, as of a load, ``weights`` has the value. What columns
-    without a header are called is given in ``names``; ``lost`` counts cells of columns that are no numbers.
-    """
+    """A log: its columns (n,) that change, on one clock."""
 
     clock: Clock
-    episodes: str | None
+    episodes: str | None  # the column that numbers them
     columns: Mapping[str, FloatArray]
     seconds: float
-    weights: Mapping[str, float]
-    names: tuple[str, ...] = ()
-    lost: Mapping[str, int] = field(default_factory=dict)
+    weights: Mapping[str, float]  # of columns in kg that do not change, as of a load
+    names: tuple[str, ...] = ()  # of columns without a header
+    lost: Mapping[str, int] = field(default_factory=dict)  # cells that are no numbers, by column
 
 
 def open_table(path: Path, table: Columns, rate: float | None = None) -> Opened:
