@@ -79,7 +79,7 @@ class Dialect(BaseModel, extra="forbid"):
             for key in {*given} - {*legal}:
                 raise problem(f"unknown; {nearest(key, legal)}", field, key)
         for pattern, value in self.patterns.items():
-            kind, _, unit = value.partition(" ")
+            kind, _, unit = value.removesuffix(" measured").partition(" ")
             if value not in _UNITS and not (kind in [*Kind] and unit in ("", *_UNITS)):
                 wrong = f"expected a kind, a unit or both, got {value!r}; {nearest(kind, Kind)}"
                 raise problem(wrong, "patterns", pattern)
@@ -148,7 +148,7 @@ _BRACKETED = re.compile(r"[\[(]\s*([^\])\d]*?[/^]?[^\])]*?)\s*[\])]")
 
 def read_name(column: str, own: Collection[str] = ()) -> Label:
     """What a name says; own: words that name something of the model, whatever quantity they are elsewhere."""
-    found, kind, fixed = _pattern_of(column)
+    found, kind, fixed, measured = _pattern_of(column)
     unit, words, numbers = _without_unit(column.translate(_GREEK), own)
     unit = fixed or unit
     named, words = [word for word in words if word in own], [word for word in words if word not in own]
@@ -164,14 +164,14 @@ def read_name(column: str, own: Collection[str] = ()) -> Label:
     return Label(
         column,
         kind,
-        (*rest, *named) if joint is None else tuple(words_of(joint)),
+        (*rest, *named) if joint is None else tuple(_flags(words_of(joint), "")[1] or words_of(joint)),
         numbers[-1] if numbers else None,
         re.sub(r"\d+(?=\D*$)", "#", column) if numbers else column,
         unit,
         False if slides else True if turns or "angle" in flags else None,
         axis,
         _without_axis(column, words[-1]) if axis else "",
-        "measured" in flags,
+        measured or "measured" in flags,
         "driven" in flags,
     )
 
@@ -195,13 +195,14 @@ def unit_of(pieces: list[str]) -> str:
     return units.get("_".join(pieces), "")
 
 
-def _pattern_of(column: str) -> tuple[re.Match[str] | None, Kind | None, str]:
-    """The first pattern of a dialect that fits a whole name, and the kind and unit that it tells."""
+def _pattern_of(column: str) -> tuple[re.Match[str] | None, Kind | None, str, bool]:
+    """The first pattern of a dialect that fits a whole name, with its kind and unit, and whether it is measured."""
     for pattern, value in vocabulary().patterns:
         if found := pattern.fullmatch(column):
-            kind, _, unit = value.partition(" ")
-            return (found, Kind(kind), unit) if kind in [*Kind] else (found, None, value)
-    return None, None, ""
+            kind, _, unit = value.removesuffix(" measured").partition(" ")
+            measured = value.endswith(" measured")
+            return (found, Kind(kind), unit, measured) if kind in [*Kind] else (found, None, value, False)
+    return None, None, "", False
 
 
 def _without_unit(plain: str, own: Collection[str]) -> tuple[str, list[str], list[int]]:

@@ -77,7 +77,6 @@ class _Target:
 
 _NEVER = -1.0  # a score up to which a column is not taken for a target
 _CALLED = 0.65  # how alike a column and a part are, from which it is called after it
-_NATURAL, _BY_NAME = 10.0, 4.0  # what each column counts that is taken for a target by its kind, by its name alone
 _FITS: dict[Drive | str, dict[Kind, float]] = {  # how well kinds of columns fit what an actuator or joint has
     "position": {Kind.POSITION: 0.0},
     "velocity": {Kind.VELOCITY: 0.0},
@@ -88,11 +87,8 @@ _FITS: dict[Drive | str, dict[Kind, float]] = {  # how well kinds of columns fit
     Drive.VOLTAGE: {Kind.VOLTAGE: 0.4, Kind.DUTY: 0.2, Kind.COMMAND: 0.0, Kind.CURRENT: -2.1, Kind.TORQUE: -2.3},
     Drive.OTHER: {Kind.COMMAND: 0.4, Kind.DUTY: 0.2, Kind.TORQUE: -0.6, Kind.VOLTAGE: -0.6, Kind.CURRENT: -1.1},
 }
-_FITS[Drive.FORCE][Kind.SETPOINT], _FITS[Drive.VOLTAGE][Kind.SETPOINT], _FITS[Drive.OTHER][Kind.SETPOINT] = (
-    -2.3,
-    -2.4,
-    -0.2,
-)
+for _drive, _fit in ((Drive.FORCE, -2.3), (Drive.VOLTAGE, -2.4), (Drive.OTHER, -0.2)):
+    _FITS[_drive][Kind.SETPOINT] = _fit
 _BECOMES = {Kind.UNKNOWN: Kind.COMMAND, Kind.POSITION: Kind.SETPOINT, Kind.VELOCITY: Kind.SPEED_SETPOINT}
 _DRIVING = {Kind.COMMAND, Kind.SETPOINT, Kind.SPEED_SETPOINT, Kind.TORQUE, Kind.DUTY}
 
@@ -127,10 +123,10 @@ def match_columns(machine: Machine, table: Table) -> Matches:
     driving = [x for x in labels if x.commanded and x.kind in {*_DRIVING, Kind.CURRENT, Kind.VOLTAGE}]
     driving = [x for x in driving if x.column not in used]
     commands += _only_one(driving, [t for t in targets if t.drive], commands)
+    rivals = [rival for rival in rivals if rival.column not in {m.column for m in (*positions, *velocities, *commands)}]
     everything = (*positions, *velocities, *commands, *vectors, *forces)
     used = {column for match in everything for column in match.columns}
     left = tuple(name for name in table if name not in used)
-    rivals = [rival for rival in rivals if rival.column not in used]
     doubts = (*open_vectors, *open_commands, *of_tendons)
     return Matches(
         tuple(positions), tuple(velocities), tuple(commands), tuple(vectors), tuple(rivals), left, doubts, tuple(forces)
@@ -190,7 +186,9 @@ def _assigned(machine: Machine, labels: Sequence[Label], targets: Sequence[_Targ
             order = 0.002 * i - 1e-6 * i * j  # where names do not decide, columns come in the order of the targets
             fit = _FITS[t.drive or t.quantity][taken] - (0.3 if t.drive else -0.05) * x.measured
             scores[i, j] = fit + _affinity(x, t, places.get(x.column), counts[j]) - order
-            base[i, j] = _NATURAL if taken == x.kind else _BY_NAME
+            felt = t.drive and not x.commanded and x.kind != Kind.DUTY  # it may be measured at the drive
+            by_name = taken != x.kind or fit <= _NEVER or (felt and x.measured)
+            base[i, j] = 4.0 if by_name else 12.0 if felt else 20.0  # what comes first, whatever it is called
     possible = scores > _NEVER
     rows, columns = scipy.optimize.linear_sum_assignment(np.where(possible, base + scores, 0.0), maximize=True)
     pairs = sorted((int(j), int(i)) for i, j in zip(rows, columns, strict=True) if possible[i, j])
@@ -328,7 +326,8 @@ def _unravelled(machine: Machine, labels: list[Label], table: Table) -> tuple[li
             values = [table[x.column] for x in family]
             pairs, blocks = _slopes(values, 2, 1), _slopes(values, 1, count)
             both = [Kind.POSITION, Kind.VELOCITY]
-            kinds = both * count if count > 1 and pairs > blocks else [kind for kind in both for _ in range(count)]
+            woven = count > 1 and len(family) > count and pairs > blocks
+            kinds = both * count if woven else [kind for kind in both for _ in range(count)]
         for k, (label, kind) in enumerate(zip(family, kinds, strict=False)):
             number = label.number if kind == Kind.OTHER else kinds[:k].count(kind)
             known[label.column] = replace(label, kind=kind, number=number, stem=f"{label.stem}{kind.name}")

@@ -337,11 +337,15 @@ def _with_shares(
     both_ways = lerobot and all(_within(values, BOTH_WAYS) for columns in bodies for values in columns)
     for joint, members, columns in groups:
         alike = [likeness(values, columns[0]) for values in columns[1:]]  # set-points that have the position's unit
-        if all(x.share > _FOLLOWS and abs(np.log(max(x.factor, 1e-9))) < np.log(1.4) for x in alike):
-            shares, likely = _shares_of(out[members[0]], joint, columns, lerobot, both_ways)
-            says = _is_percent(out[members[0]])
-            for k in members if shares else ():
-                out[k] = _read_as_share(out[k], joint, shares, likely, says)
+        if not all(x.share > _FOLLOWS and abs(np.log(max(x.factor, 1e-9))) < np.log(1.4) for x in alike):
+            continue
+        ends, likely = _ends_of(out[members[0]], joint, columns, lerobot, both_ways)
+        says, share = _is_percent(out[members[0]]), Scale("rad" if joint.hinge else "m", 1.0, ends)
+        for k in members if ends else ():
+            reading = replace(out[k], shares=() if says else (share,), reach=joint.reach)
+            if says:  # of which nothing else is asked
+                reading = _noted(replace(_named(reading, ""), scales=()), f"{share}, as its name says")
+            out[k] = reading.read_as(share) if likely else reading
     return out[: len(positions)], out[len(positions) :]
 
 
@@ -360,30 +364,18 @@ def _is_percent(reading: Reading) -> bool:
     return "%" in (reading.match.label.unit, *(vocabulary().units.get(p) for p in pieces_of(reading.match.column)))
 
 
-def _shares_of(
+def _ends_of(
     reading: Reading, joint: Joint, columns: Sequence[FloatArray], lerobot: bool, both_ways: bool
-) -> tuple[tuple[Scale, ...], bool]:
-    """What shares a joint's columns may be, and whether that is likelier than any unit."""
-    whole, halves = (Scale("rad" if joint.hinge else "m", 1.0, ends) for ends in (PERCENT, BOTH_WAYS))
+) -> tuple[tuple[float, float] | None, bool]:
+    """What a joint's columns may say at the ends of its range, and whether that is likelier than any unit."""
     one_way = all(_within(values, PERCENT) for values in columns)
     if _is_percent(reading):
-        return (whole if one_way else halves,), True
+        return PERCENT if one_way else BOTH_WAYS, True
     if reading.match.label.unit or max(float(np.nanmax(np.abs(values))) for values in columns) < 7:  # as well rad
-        return (), False
+        return None, False
     low, high = joint.reach or (-np.inf, np.inf)
     smallest, values = find_unit("deg" if joint.hinge else "mm").factor, columns[0]
     leaves = bool(smallest * np.nanmax(values) > 1.15 * max(high, 0.0) or smallest * np.ptp(values) > high - low)
     if _grips(joint, reading):
-        return (whole,) * one_way, one_way and (lerobot or leaves)
-    if lerobot and both_ways:
-        return (halves,), False
-    return (whole,) * (one_way and leaves), False
-
-
-def _read_as_share(reading: Reading, joint: Joint, shares: tuple[Scale, ...], likely: bool, says: bool) -> Reading:
-    """A reading with shares; of what is called a percentage nothing else is asked."""
-    if says:
-        reading = _noted(_named(reading, ""), f"{shares[0]}, as its name says")
-        return replace(reading, scales=(), reach=joint.reach).read_as(shares[0])
-    reading = replace(reading, shares=shares, reach=joint.reach)
-    return reading.read_as(shares[0]) if likely else reading
+        return PERCENT if one_way else None, one_way and (lerobot or leaves)
+    return BOTH_WAYS if lerobot and both_ways else PERCENT if one_way and leaves else None, False

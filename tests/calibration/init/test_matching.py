@@ -322,3 +322,38 @@ def test_the_encoder_of_what_pulls_a_tendon_measures_no_joint(beside: str, doubt
     assert targets == {"mcp_deg": "joint:mcp.position"} | ({} if doubted else {beside: "joint:dip.position"})
     assert any("called as what pulls a tendon" in doubt for doubt in matches.doubts) == doubted
     assert [m.column for m in matches.commands] == ["cmd_flexor_mA"]
+
+
+JOINTS_OF = [("shoulder", "elbow", "wrist"), ("joint_1", "joint_2", "joint_3"), ("A1", "A2", "A3")]
+
+
+@pytest.mark.parametrize("joints", JOINTS_OF)
+    "joints", [("shoulder", "elbow", "wrist"), ("joint_1", "joint_2", "joint_3"), ("A1", "A2", "A3")]
+)
+@pytest.mark.parametrize(
+    "columns",
+    [
+        ("/joint_states.position[{j}]", "/joint_states.velocity[{j}]", "tau{i}", "/joint_states.effort[{j}]"),
+        ("q[{k}]", "qd[{k}]", "u{i}", "{j}_current_mA"),  # what is told comes before what is measured
+        ("{j}_meas", "omega_{j}", "cmd_{k}", "{j}_effort"),
+        ("present_position_{i}", "present_velocity_{i}", "goal_pwm_{i}", "present_current_{i}"),
+        ("observation.state.{j}.pos", "{j}_dot", "torque_cmd_{j}", "load_{i}"),
+        ("theta{i}", "joint_{i}_vel", "ctrl[{k}]", "tau_meas_{j}"),
+    ],
+)
+def test_columns_of_many_dialects_in_any_order(joints: tuple[str, ...], columns: tuple[str, ...]) -> None:
+    machine, random = chain(*joints), np.random.default_rng(0)
+    targets = ("joint:{j}.position", "joint:{j}.velocity", "actuator:motor_{j}", None)
+    truth, table = dict[str, str](), dict[str, np.ndarray]()
+    for column, target in zip(columns, targets, strict=True):
+        for k, joint in enumerate(joints):
+            name = column.format(i=k + 1, k=k, j=joint)
+            motion = np.sin((1.3 + 0.7 * k) * np.arange(0, 9, 0.03))
+            rate = (1.3 + 0.7 * k) * np.cos((1.3 + 0.7 * k) * np.arange(0, 9, 0.03))
+            table[name] = {targets[0]: motion, targets[1]: rate}.get(target, random.standard_normal(300))
+            truth |= {target.format(j=joint): name} if target else {}
+    for _ in range(3):
+        order = random.permutation(list(table)).tolist()
+        matches = match_columns(machine, {name: table[name] for name in order})
+        found = {m.target: m.column for m in (*matches.positions, *matches.velocities, *matches.commands)}
+        assert found == truth, order
