@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pandas as pd
 import pytest
 
-from sipe_bayes.calibration.column_names import read_name
 from sipe_bayes.calibration.init.propose import propose
-from sipe_bayes.calibration.init.readings import _pulse
 from sipe_bayes.calibration.init.validate import validate_config
 from sipe_bayes.calibration.init.write import toml_of
-from sipe_bayes.calibration.machine import Machine
 from sipe_bayes.calibration.problem import prepare
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
@@ -79,27 +75,6 @@ def test_a_command_that_its_ctrlrange_cuts_off_is_odd(tmp_path: Path) -> None:
     odd = validate_config(tmp_path / "wrong.toml").odd
     cut = "% of it lies outside of the ctrlrange [0.0, 1.0] of actuator:fan"
     assert any("column 'pwm'" in line and cut in line for line in odd), odd
-
-
-@pytest.mark.parametrize(
-    ("column", "limits", "widths", "none"),
-    [
-        ("pwm", "-2000 2000", (900, 2100), None),  # of the actuator's own range
-        ("motor_us", "-2000 2000", (900, 2100), 1500.0),
-        ("pwm", "-1 1", (900, 2100), 1500.0),
-        ("pwm", "-1 1", (300, 2100), None),  # too short for a pulse
-        ("pwm", None, (1100, 1900), 1500.0),
-        ("u", None, (1100, 1900), None),  # which nothing says
-    ],
-)
-def test_what_is_taken_for_a_pulse(
-    column: str, limits: str | None, widths: tuple[float, float], none: float | None
-) -> None:
-    xml = CART.replace("RANGE", limits or "0 0").replace("GEAR", "1")
-    xml = xml if limits else xml.replace('ctrllimited="true"', 'ctrllimited="false"')
-    (actuator,) = Machine.of(mujoco.MjModel.from_xml_string(xml)).actuators
-    pulse = _pulse(np.array([0.0, *widths]), actuator, read_name(column))
-    assert (None if pulse is None else pulse[0]) == none
 
 
 def test_a_controller_that_is_not_armed_yet_is_doubted(tmp_path: Path) -> None:
