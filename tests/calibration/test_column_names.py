@@ -97,11 +97,10 @@ def test_a_users_file_comes_first(users_file: Path) -> None:
         ("[mine.words]\nangel = 'hoek'", "key `mine.words.angel`: unknown; did you mean 'angle'"),
         ("[mine.units]\ndegree = 'gr'", "key `mine.units.degree`: unknown; "),
         ("[mine.patterns]\n'*_stand' = 'positon'", "got 'positon'; did you mean 'position'"),
-        ("[mine]\nwrods = {}", "key `mine.wrods`: "),
-        ("[mine.words]\nangle = 3", "key `mine.words.angle`: "),
+        ("[mine]\nwrods = {}", "key `mine.wrods`: "), ("[mine.words]\nangle = 3", "key `mine.words.angle`: "),
         ("[mine", "not valid TOML"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_users_file_is_named_in_one_line(text: str, message: str, users_file: Path) -> None:
     users_file.write_text(text)
     vocabulary.cache_clear()

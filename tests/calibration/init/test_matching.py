@@ -70,19 +70,14 @@ def test_what_drives_nothing_is_no_command(word: str) -> None:
 @pytest.mark.parametrize(
     ("stem", "beside", "quantity", "sure"),
     [
-        ("base_vel_w{}", "", "angular", False),
-        ("base_vel_w{}", "base_vel_{}", "angular", True),
-        ("base_vel_w{}_rad_s", "", "angular", True),
-        ("base_vel_w{}_m_s", "", "linear", True),
-        ("base_lin_vel_w{}", "", "linear", False),
-        ("base_lin_vel_w_{}", "", "linear", True),
-        ("base_vel_w_{}", "", "linear", False),
-        ("base_vel_w_{}", "base_ang_vel_{}", "linear", True),
-        ("base_ang_vel_w_{}", "", "angular", True),
-        ("base_w{}", "", "angular", True),
+        ("base_vel_w{}", "", "angular", False), ("base_vel_w{}", "base_vel_{}", "angular", True),
+        ("base_vel_w{}_rad_s", "", "angular", True), ("base_vel_w{}_m_s", "", "linear", True),
+        ("base_lin_vel_w{}", "", "linear", False), ("base_lin_vel_w_{}", "", "linear", True),
+        ("base_vel_w_{}", "", "linear", False), ("base_vel_w_{}", "base_ang_vel_{}", "linear", True),
+        ("base_ang_vel_w_{}", "", "angular", True), ("base_w{}", "", "angular", True),
         ("base_v{}", "", "linear", True),
     ],
-)
+)  # fmt: skip
 def test_a_rate_or_the_world(stem: str, beside: str, quantity: str, sure: bool) -> None:
     names = [stem.format(axis) for axis in "xyz"]
     matches = matched(flying(), [*POSE, *names, *(beside.format(axis) for axis in "xyz" if beside)])
@@ -115,11 +110,9 @@ def test_an_inertial_unit_that_the_model_lacks_measures_no_joint() -> None:
 @pytest.mark.parametrize(
     ("sensors", "joint", "target"),
     [
-        ('<gyro name="imu" site="t0"/>', "", "sensor:imu"),
-        ("", "", "body:base.angular_velocity"),
-        ("", "gx", None),
+        ('<gyro name="imu" site="t0"/>', "", "sensor:imu"), ("", "", "body:base.angular_velocity"), ("", "gx", None),
     ],
-)
+)  # fmt: skip
 def test_a_gyro_of_a_free_body(sensors: str, joint: str, target: str | None) -> None:
     """Without one in the model it tells the body's rates about the world's axes, which is told; a joint comes first."""
     matches = matched(flying(sensors, joint), [*POSE, "gx", "gy", "gz"])
@@ -186,7 +179,7 @@ BEAM = """<mujoco><worldbody><body name="beam"><joint name="tilt"/><geom size=".
         (["u", "servo_deg", "beam_deg", "ball_mm"], "u", ["beam_deg", "ball_mm"]),
         (["tilt_servo_deg", "ball_mm"], None, ["tilt_servo_deg", "ball_mm"]),  # called as the joint too
     ],
-)
+)  # fmt: skip
 def test_a_column_called_as_an_actuator_drives_it_where_nothing_else_does(
     columns: list[str], driving: str | None, measured: list[str]
 ) -> None:
@@ -202,7 +195,7 @@ def test_a_column_called_as_an_actuator_drives_it_where_nothing_else_does(
         (["Pressure (bar)", "beam_deg", "ball_mm"], None),  # which is measured, for all that is said
         (["Pressure set (bar)", "Valve set (V)", "beam_deg", "ball_mm"], None),  # either may
     ],
-)
+)  # fmt: skip
 def test_the_one_command_drives_the_one_actuator_whatever_it_is_called(columns: list[str], driving: str | None) -> None:
     matches = matched(Machine.of(mujoco.MjModel.from_xml_string(BEAM.format(kind="motor"))), columns)
     assert [m.column for m in matches.commands] == [driving] * (driving is not None)
@@ -220,7 +213,7 @@ SLIDE = """<mujoco><worldbody><body name="cart"><joint name="drive" type="slide"
         ("push", ["u", "drive"], "u", ["drive"]),
         ("drive", ["drive", "cart [m]"], "drive", ["cart [m]"]),  # an actuator that is called so
     ],
-)
+)  # fmt: skip
 def test_a_word_for_commands_that_a_joint_is_called_by_is_its_name(
     actuator: str, columns: list[str], driving: str, measured: list[str]
 ) -> None:
@@ -280,7 +273,7 @@ def test_only_what_nothing_names_is_taken_by_order() -> None:
         (["u", "beam_deg", "counter"], ["beam_deg"]),  # it only rises
         (["u", "beam_deg", "kugel_weg", "counter"], ["beam_deg", "kugel_weg"]),
     ],
-)
+)  # fmt: skip
 def test_the_one_column_left_measures_the_one_joint_left(columns: list[str], measured: list[str]) -> None:
     walks = np.cumsum(np.random.default_rng(0).standard_normal((len(columns), 60)), axis=1)
     table = {name: np.arange(60.0) if name == "counter" else walk for name, walk in zip(columns, walks, strict=True)}
@@ -298,7 +291,7 @@ def test_the_one_column_left_measures_the_one_joint_left(columns: list[str], mea
         (("axisA", "axisB"), ("{}_position", "{}_velocity", "{}_current", "{}_soll")),
         (("F1", "F2"), ("{}_position", "{}_rpm", "{}_current_A", "spare_{}")),
     ],
-)
+)  # fmt: skip
 def test_joints_of_one_letter_are_no_quantities(joints: tuple[str, str], columns: tuple[str, ...]) -> None:
     names = [column.format(joint) for column in columns for joint in joints]
     random = np.random.default_rng(0)

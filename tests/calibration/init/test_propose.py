@@ -75,18 +75,23 @@ def test_a_spring_that_the_model_lacks_hides_no_delay(kind: str, variant: int, s
 
 
 def test_samples_that_are_missing_hide_nothing(tmp_path: Path) -> None:
-    """A sensor at a fifth of the other's rate, frames that were dropped, and a gap; in a text file with remarks."""
+    """A sensor at a fifth of the other's rate, dropped frames, cells of text, and a gap; in a file with remarks."""
     truth = make_log(tmp_path, KINDS["arm"], 1, 3)
-    table = pd.read_csv(tmp_path / "log.csv")
+    table = pd.read_csv(tmp_path / "log.csv").astype(object)
     rows = np.arange(len(table))
     table.loc[rows % 5 > 0, "joint_2_pos"] = np.nan
     table.loc[(rows > 300) & (rows < 330), ["joint_1_pos", "joint_2_pos"]] = np.nan
-    table = table[np.random.default_rng(0).uniform(size=len(table)) > 0.05]
+    table.loc[[7, 90, 91], "joint_1_pos"] = "ERR"
+    table["temp"], table["state"] = np.where(rows % 2, "ERR", "20.5"), np.where(rows % 9, "run", "stop")
+    table = table[(np.random.default_rng(0).uniform(size=len(table)) > 0.05) | (rows < 100)]
     text = "# arm of bench 2\n# started by hand\n" + table.to_csv(index=False, sep="\t")
     (tmp_path / "log.txt").write_text(text)
     draft = propose(tmp_path / "model.xml", [tmp_path / "log.txt"], tmp_path)
     assert not wrong(draft, truth)
     assert {"upper_arm_mass", "forearm_mass", "shoulder_damping"} <= {unknown.name for unknown in draft.proposed}
+    missing, unused = sorted(doubt for doubt in draft.open_doubts if "no numbers" in doubt)
+    assert missing.startswith("'joint_1_pos': cells that are no numbers (3) are read as missing; correct the log")
+    assert unused.startswith("'temp'")
 
 
 def test_angles_against_the_world_are_told_from_those_of_joints(tmp_path: Path) -> None:
@@ -258,25 +263,3 @@ def test_a_weight_that_logs_state_is_asked_for(tmp_path: Path) -> None:
     assert doubt.startswith("'payload_kg' is 0 to 60 kg by log")
     assert "added" in doubt
     assert ask_of_columns([opened]) == []
-
-
-def test_cells_that_are_no_numbers_are_missing_and_counted(tmp_path: Path) -> None:
-    """Also where the configuration is read; a column of words is none."""
-    truth = make_log(tmp_path, KINDS["arm"], 1, 3)
-    table = pd.read_csv(tmp_path / "log.csv").astype(object)
-    column = next(column for column, target in truth.columns if target.endswith(".position"))
-    table.loc[[7, 90, 91], column] = "ERR"
-    table["temp"] = ["ERR", 20.0] * (len(table) // 2) + [20.0] * (len(table) % 2)
-    table["state"] = ["run", "stop"] * (len(table) // 2) + ["stop"] * (len(table) % 2)
-    table.to_csv(tmp_path / "log.csv", index=False)
-    draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
-    assert wrong(draft, truth) == []
-    missing, unused = sorted(doubt for doubt in draft.open_doubts if "no numbers" in doubt)
-    assert unused.startswith("'temp'")
-    assert "leave nothing of it to be used" in unused
-    remedy = "correct the log, or leave such cells blank"
-    assert missing == f"{column!r}: cells that are no numbers (3) are read as missing; {remedy}"
-    (tmp_path / "calibrate.toml").write_text(toml_of(draft, "sipe init"))
-    config = load_config(tmp_path / "calibrate.toml")
-    trajectory, _ = load_log(config, config.logs[0])
-    assert np.isfinite(trajectory.observations).mean() > 0.9

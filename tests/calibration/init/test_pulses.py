@@ -45,7 +45,7 @@ def _record(folder: Path, limits: str, gear: float, column: str, pulses: FloatAr
         ("-1 1", "u", 1300, 1700, 1500.0, 500.0),  # told by the ctrlrange alone
         ("-2000 2000", "u", 900, 2100, 0.0, 1.0),  # a force
     ],
-)
+)  # fmt: skip
 def test_pulses_become_shares_of_the_ctrlrange(
     tmp_path: Path, limits: str, column: str, low: int, high: int, zero: float, span: float
 ) -> None:

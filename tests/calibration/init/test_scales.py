@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sipe_bayes.calibration.column_names import read_name
 from sipe_bayes.calibration.config import load_config
 from sipe_bayes.calibration.init.decisions import as_well
-from sipe_bayes.calibration.init.draft import Draft, Reading, Scale
-from sipe_bayes.calibration.init.matching import Match
+from sipe_bayes.calibration.init.draft import Draft, Scale
+from sipe_bayes.calibration.init.matching import match_columns
 from sipe_bayes.calibration.init.propose import propose
-from sipe_bayes.calibration.init.readings import counting_alike
+from sipe_bayes.calibration.init.readings import first_readings
+from sipe_bayes.calibration.init.tables import Clock
 from sipe_bayes.calibration.init.write import toml_of
 from sipe_bayes.calibration.machine import Machine
 from sipe_bayes.calibration.problem import prepare
@@ -155,21 +155,18 @@ def test_what_may_be_right_as_well_stands_in_one_line(
 
 
 def test_encoders_of_two_sides_count_alike() -> None:
-    """One that went through few turns and one that went through many: what both may be."""
-    axle = """<mujoco><worldbody>{}</worldbody></mujoco>"""
-    wheel = '<body name="{0}_wheel"><joint name="{0}"/><geom size=".1"/></body>'
-    machine = Machine.of(mujoco.MjModel.from_xml_string(axle.format(wheel.format("left") + wheel.format("right"))))
+    """One that went through few turns and one that went through many: what both may be; an arm's have their own."""
+    few_turns, many_turns = Scale("rev", 1 / 131072), Scale("rev", 1 / 360)  # beyond which one of both went
 
-    def reading(column: str, joint: str, counts: tuple[int, ...]) -> Reading:
-        match = Match((column,), f"joint:{joint}.position", read_name(column, set()), 1.0)
-        scales = tuple(Scale("rev", 1 / n) for n in counts)
-        return Reading(match, "rev", factor=scales[0].factor, scales=scales)
+    def counts(one: str, other: str) -> list[tuple[Scale, ...]]:
+        wheels = "".join(f'<body><joint name="{joint}"/><geom size=".1"/></body>' for joint in (one, other))
+        machine = Machine.of(mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{wheels}</worldbody></mujoco>"))
+        swing, clock = np.sin(np.arange(99)), Clock("t", "s", 0.01, "")
+        table = {f"enc_{one}": np.round(400 * swing), f"enc_{other}": np.round(9e4 * swing)}
+        return [r.scales for r in first_readings(machine, match_columns(machine, table), table, {}, clock)[0]]
 
-    few, many = reading("enc_left", "left", (1024, 1000, 360)), reading("enc_right", "right", (4096, 1024, 1000))
-    for one in counting_alike([few, many], machine):
-        assert (one.factor, one.scales) == (1 / 1024, (Scale("rev", 1 / 1024), Scale("rev", 1 / 1000)))
-    other = reading("motor_right", "right", (4096, 1024, 1000))
-    assert counting_alike([few, other], machine) == [few, other]
-    arm = Machine.of(mujoco.MjModel.from_xml_string(axle.format(wheel.format("shoulder") + wheel.format("elbow"))))
-    geared = [reading("enc_shoulder", "shoulder", (1024, 1000)), reading("enc_elbow", "elbow", (4096, 1000))]
-    assert counting_alike(geared, arm) == geared  # joints of an arm have gears of their own
+    left, right = counts("left", "right")
+    assert left == right != ()
+    assert not {few_turns, many_turns} & {*left}
+    shoulder, elbow = counts("shoulder", "elbow")
+    assert (many_turns in shoulder, few_turns in elbow) == (True, True)

@@ -62,10 +62,9 @@ def first(jaw: str, columns: dict[str, FloatArray]) -> tuple[dict[str, Reading],
     [
         (HINGE, LEROBOT, led(0, 95), True),
         (HINGE, PLAIN, led(0, 95), False),  # as well degrees
-        (HINGE.replace("1.75", "0.6"), PLAIN, led(0, 95), True),
-        (SLIDE, PLAIN, led(3, 95), True),
+        (HINGE.replace("1.75", "0.6"), PLAIN, led(0, 95), True), (SLIDE, PLAIN, led(3, 95), True),
     ],
-)
+)  # fmt: skip
 def test_a_gripper_from_0_to_100_may_be_a_share_of_its_range(
     jaw: str, form: dict[str, str], gripper: FloatArray, likely: bool
 ) -> None:
@@ -85,7 +84,7 @@ def test_a_gripper_from_0_to_100_may_be_a_share_of_its_range(
         (LEROBOT, led(-160, 120, 0.9), led(-130, 60)),
         ({"measured": "{}_position_deg", "command": "{}_cmd_deg"}, led(-50, 60, 0.9), led(0, 95)),
     ],
-)
+)  # fmt: skip
 def test_other_columns_are_none(form: dict[str, str], elbow: FloatArray, gripper: FloatArray) -> None:
     readings, _, _ = first(HINGE, table(form, elbow, gripper))
     assert not any(reading.shares or reading.ends for reading in readings.values())

@@ -46,16 +46,13 @@ def test_lists_have_names_where_there_are_as_many(tmp_path: Path) -> None:
     assert {"control.timestamp", "state.timestamp", "state.positions[Pan]", "event.event"} <= {*read_table(root)}
     (root / JOINTS).write_text("Pan\n\nLift\nGrip\n")
     assert {"state.positions[0]", "state.positions[1]"} <= {*read_table(root)}
+    (root / JOINTS).write_text("Pan\nLift\nPan\n")
+    with pytest.raises(LogError, match=r"joint_list.txt: 'Pan' stands in it twice; give each joint a name of its own"):
+        read_table(root)
+    (root / JOINTS).write_text("Pan\nLift\n")
     for file in root.glob("*.csv"):
         file.unlink()
     with pytest.raises(LogError, match=r"motion: no CSV file beside joint_list.txt; name"):
-        read_table(root)
-
-
-def test_a_name_that_stands_twice_in_a_list_of_joints(tmp_path: Path) -> None:
-    root = joined_folder(tmp_path, regular(200)).path
-    (root / "joint_list.txt").write_text("Pan\nPan\n")
-    with pytest.raises(LogError, match=r"joint_list.txt: 'Pan' stands in it twice; give each joint a name of its own"):
         read_table(root)
 
 
