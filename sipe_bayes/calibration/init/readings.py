@@ -53,7 +53,7 @@ def first_readings(
 ) -> tuple[tuple[Reading, ...], tuple[Reading, ...]]:
     """Measurements and commands as names and numbers alone tell them."""
     positions = [_position(machine, m, table, turns) for m in matches.positions]
-    positions = [_by_velocity(reading, matches, table, clock) for reading in counting_alike(positions, machine)]
+    positions = [_by_velocity(reading, matches, table, clock) for reading in _with_common_counts(positions, machine)]
     vectors = [_vector(m, table) for m in matches.vectors]
     velocities = [Reading(m, _unit(m, _joint_unit(machine, m, "/s"))) for m in matches.velocities]
     drives = {f"actuator:{actuator.name}": actuator for actuator in machine.actuators}
@@ -122,7 +122,7 @@ def _counts(values: FloatArray, label: Label) -> tuple[Scale, ...]:
     return tuple(Scale("rev", 1 / n) for n in _COUNTS if 0.01 < span / n < 12.0)
 
 
-def counting_alike(positions: Sequence[Reading], machine: Machine) -> list[Reading]:
+def _with_common_counts(positions: Sequence[Reading], machine: Machine) -> list[Reading]:
     """Positions of which columns that are called alike but for a side, as their joints are, count alike."""
     names = {f"joint:{joint.name}.position": joint.name for joint in machine.joints}
     sides, pairs = vocabulary().of("side"), defaultdict[tuple[str, ...], list[int]](list)
