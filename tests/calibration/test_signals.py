@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from sipe_bayes.calibration.signals import likeness, slope_of, time_unit, turn_of, white_share
+from sipe_bayes.calibration.signals import likeness, slope_of, turn_of, white_share
 
 TIME = np.arange(2000) * 0.004
 ANGLE = np.sin(3 * TIME) + 0.3 * np.sin(11 * TIME)
@@ -24,6 +24,8 @@ def test_a_filter_s_lag_shows_and_another_signal_is_no_slope() -> None:
     late = scipy.signal.lfilter([0.2], [1, -0.8], SPEED)  # four samples at low frequencies
     assert slope_of(ANGLE, late).lag == pytest.approx(4, abs=1)
     assert slope_of(ANGLE, np.sin(7 * TIME)).share < 0.2
+    assert likeness(2 * ANGLE, np.roll(ANGLE, 5)) == pytest.approx((2, 1), rel=0.01)  # a set-point and what follows it
+    assert likeness(np.cos(23 * TIME), ANGLE).share < 0.2
 
 
 @pytest.mark.parametrize("turn", [360.0, 2 * np.pi, 1.0])
@@ -34,20 +36,7 @@ def test_turns_are_seen_and_nothing_else(turn: float) -> None:
     assert turn_of(0.4 * turn * np.sign(ANGLE)) == 0.0  # switched, not turned
 
 
-@pytest.mark.parametrize(
-    ("period", "unit"), [(0.001, "s"), (0.05, "s"), (1, "ms"), (20, "ms"), (2000, "us"), (1e6, "ns")]
-)
-def test_clocks_by_their_steps(period: float, unit: str) -> None:
-    assert time_unit(period) == unit
-
-
 def test_filtered_columns_lack_noise_above() -> None:
     noise = 1e-3 * np.random.default_rng(0).standard_normal(len(TIME))
     assert 0.5 < white_share(ANGLE + noise) < 2
     assert white_share(ANGLE + scipy.signal.lfilter(*scipy.signal.butter(2, 0.1), noise)) < 0.05
-
-
-def test_a_set_point_looks_like_what_follows_it() -> None:
-    assert likeness(2 * ANGLE, np.roll(ANGLE, 5)).share > 0.99
-    assert likeness(2 * ANGLE, np.roll(ANGLE, 5)).factor == pytest.approx(2, rel=0.01)
-    assert likeness(np.cos(23 * TIME), ANGLE).share < 0.2
