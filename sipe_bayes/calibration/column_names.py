@@ -288,6 +288,7 @@ def alike(words: Collection[str], *names: str) -> float:
     return max(out)
 
 
+@functools.cache
 def _similar(a: str, b: str) -> float:
     short, long = sorted((a, b), key=len)
     if a == b:

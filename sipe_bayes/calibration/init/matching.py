@@ -316,7 +316,10 @@ def _unravelled(machine: Machine, labels: list[Label], table: Table) -> tuple[li
         families[label.stem if label.number is not None else ""].append(label)
     count, positions = len(machine.joints), [x.column for x in labels if x.kind == Kind.POSITION]
     known = {x.column: x for x in labels}
-    for label, kind in zip(loose := families.pop("", []), _loose(loose, positions, table), strict=True):
+    for label in families.pop("", []):
+        shares = [slope_of(table[place], table[label.column]).share for place in positions]
+        desired = label.column.lower().rstrip("0123456789").endswith("d")  # q_d that is no slope
+        kind = Kind.VELOCITY if max(shares, default=0.0) > 0.8 else Kind.SETPOINT if desired else Kind.OTHER
         known[label.column] = replace(label, kind=kind)
     states = [s for s, f in families.items() if count and not positions and len(f) in (count, 2 * count)]
     driving, doubts = _driving(machine, {s: f for s, f in families.items() if s not in states}, labels)
@@ -338,25 +341,6 @@ def _slopes(values: Sequence[FloatArray], step: int, ahead: int) -> float:
     """How well each column ``ahead`` of another is its slope."""
     pairs = [(values[i], values[i + ahead]) for i in range(0, len(values) - ahead, step)][: len(values) // 2]
     return sum(slope_of(p, v).share for p, v in pairs)
-
-
-def _loose(family: Sequence[Label], places: Sequence[str], table: Table) -> list[Kind]:
-    """A column is a velocity where it is the slope of a position, or of another one of them, which then is one."""
-
-    def follows(position: str, velocity: str) -> bool:
-        return slope_of(table[position], table[velocity]).share > 0.8
-
-    def kind_of(column: str) -> Kind:
-        others = [] if places else [x.column for x in family if x.column != column]
-        if any(follows(place, column) for place in places):
-            return Kind.VELOCITY
-        if column.lower().rstrip("0123456789").endswith("d"):
-            return Kind.SETPOINT  # q_d that is no slope: desired
-        if any(follows(column, other) for other in others):
-            return Kind.POSITION
-        return Kind.VELOCITY if any(follows(other, column) for other in others) else Kind.OTHER
-
-    return [kind_of(x.column) for x in family]
 
 
 def _driving(
