@@ -101,12 +101,12 @@ class Vocabulary:
 
 
 @functools.cache
-def vocabulary() -> Vocabulary:
+def read_vocabulary() -> Vocabulary:
     """The package's sections, and before them the user's; raises ConfigError for a file that cannot be used."""
     package = Path(__file__).with_suffix(".toml")
     user = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "sipe_bayes" / package.name
-    given = _dialects(package)
-    own = _dialects(user, {kind for dialect in given for kind in dialect.words}) if user.is_file() else []
+    given = _read_dialects(package)
+    own = _read_dialects(user, {kind for dialect in given for kind in dialect.words}) if user.is_file() else []
     kinds: dict[str, set[str]] = {}
     for dialects in (given, own):
         new: dict[str, set[str]] = defaultdict(set)
@@ -118,12 +118,12 @@ def vocabulary() -> Vocabulary:
     return Vocabulary(
         kinds,
         {word: unit for unit, words in spelt for word in words.split()},
-        [(_compiled(pattern), value) for dialect in (*own, *given) for pattern, value in dialect.patterns.items()],
+        [(_compile(pattern), value) for dialect in (*own, *given) for pattern, value in dialect.patterns.items()],
         [rule for dialect in (*own, *given) for rule in dialect.rules],
     )
 
 
-def _dialects(path: Path, known: Collection[str] = ()) -> list[Dialect]:
+def _read_dialects(path: Path, known: Collection[str] = ()) -> list[Dialect]:
     text = read_text(path, "names of columns", "give a TOML file in UTF-8", ConfigError)
     try:
         return [*TypeAdapter(dict[str, Dialect]).validate_python(tomllib.loads(text), context=known).values()]
@@ -133,7 +133,7 @@ def _dialects(path: Path, known: Collection[str] = ()) -> list[Dialect]:
         raise ConfigError(f"{path}: {one_line(error.errors()[0])}") from None
 
 
-def _compiled(pattern: str) -> re.Pattern[str]:
+def _compile(pattern: str) -> re.Pattern[str]:
     """A pattern without capitals is of any letters."""
     text = re.escape(pattern).replace(r"\*", ".*").replace(r"\{joint\}", "(?P<joint>.+)")
     return re.compile(text, re.IGNORECASE if pattern == pattern.lower() else 0)
@@ -148,14 +148,14 @@ _BRACKETED = re.compile(r"[\[(]\s*([^\])\d]*?[/^]?[^\])]*?)\s*[\])]")
 
 def read_name(column: str, own: Collection[str] = ()) -> Label:
     """What a name says; own: words that name something of the model, whatever quantity they are elsewhere."""
-    found, kind, fixed, measured = _pattern_of(column)
-    unit, words, numbers = _without_unit(column.translate(_GREEK), own)
+    found, kind, fixed, measured = _find_pattern(column)
+    unit, words, numbers = _split_unit(column.translate(_GREEK), own)
     unit = fixed or unit
     named, words = [word for word in words if word in own], [word for word in words if word not in own]
-    flags, rest = _flags(words, unit)
-    kind = kind or next((kind for kind, rule in vocabulary().rules if _holds(rule, flags)), Kind.UNKNOWN)
+    flags, rest = _find_flags(words, unit)
+    kind = kind or next((kind for kind, rule in read_vocabulary().rules if _holds(rule, flags)), Kind.UNKNOWN)
     unit = "" if "gauge" in flags and kind != Kind.OTHER else unit
-    axis = _axis(words)
+    axis = _find_axis(words)
     if axis and kind in (Kind.POSITION, Kind.UNKNOWN) and _is_quaternion(words):
         kind = Kind.QUATERNION
     turns = bool(flags & {"in_angle", "in_angular_velocity", "gyro"})
@@ -164,13 +164,13 @@ def read_name(column: str, own: Collection[str] = ()) -> Label:
     return Label(
         column,
         kind,
-        (*rest, *named) if joint is None else tuple(_flags(words_of(joint), "")[1] or words_of(joint)),
+        (*rest, *named) if joint is None else tuple(_find_flags(split_words(joint), "")[1] or split_words(joint)),
         numbers[-1] if numbers else None,
         re.sub(r"\d+(?=\D*$)", "#", column) if numbers else column,
         unit,
         False if slides else True if turns or "angle" in flags else None,
         axis,
-        _without_axis(column, words[-1]) if axis else "",
+        _drop_axis(column, words[-1]) if axis else "",
         measured or "measured" in flags,
         "driven" in flags,
     )
@@ -181,23 +181,23 @@ def pieces_of(name: str) -> list[str]:
     return [piece.lower() for piece in _PIECE.findall(name)]
 
 
-def words_of(name: str) -> list[str]:
+def split_words(name: str) -> list[str]:
     """Its words, in small letters."""
     return [piece for piece in pieces_of(name) if not piece.isdigit()]
 
 
-def unit_of(pieces: list[str]) -> str:
+def spell_unit(pieces: list[str]) -> str:
     """The unit that some words of a name spell; "" for none."""
-    pieces, units = [piece for piece in pieces if piece != "per"], vocabulary().units
+    pieces, units = [piece for piece in pieces if piece != "per"], read_vocabulary().units
     if len(pieces) == 2 and pieces[1] in ("s", "sec", "second"):
         rate = f"{units.get(pieces[0])}/s"
         return rate if rate in UNITS else ""
     return units.get("_".join(pieces), "")
 
 
-def _pattern_of(column: str) -> tuple[re.Match[str] | None, Kind | None, str, bool]:
+def _find_pattern(column: str) -> tuple[re.Match[str] | None, Kind | None, str, bool]:
     """The first pattern of a dialect that fits a whole name, with its kind and unit, and whether it is measured."""
-    for pattern, value in vocabulary().patterns:
+    for pattern, value in read_vocabulary().patterns:
         if found := pattern.fullmatch(column):
             kind, _, unit = value.removesuffix(" measured").partition(" ")
             measured = value.endswith(" measured")
@@ -205,20 +205,20 @@ def _pattern_of(column: str) -> tuple[re.Match[str] | None, Kind | None, str, bo
     return None, None, "", False
 
 
-def _without_unit(plain: str, own: Collection[str]) -> tuple[str, list[str], list[int]]:
+def _split_unit(plain: str, own: Collection[str]) -> tuple[str, list[str], list[int]]:
     """The unit that a name says, and its words and numbers without that."""
     unit = ""
     for match in _BRACKETED.finditer(plain):  # "angle [deg]", "speed (rad/s)"
-        if word := unit_of(re.findall(r"[a-z%]+", match[1].lower())):
+        if word := spell_unit(re.findall(r"[a-z%]+", match[1].lower())):
             unit, plain = word, plain.replace(match[0], " ")
     unit = unit or ("%" if plain.rstrip().endswith("%") else "")  # valve_%
-    words, numbers = words_of(plain), [int(piece) for piece in pieces_of(plain) if piece.isdigit()]
+    words, numbers = split_words(plain), [int(piece) for piece in pieces_of(plain) if piece.isdigit()]
     last = re.split(r"[^A-Za-z]+", plain.rstrip("0123456789_ "))[-1]
     spelt = [(len(_PIECE.findall(last)), [last.lower()])]  # mA, mNm, kN
     for length, pieces in spelt * (spelt[0][0] > 1) + [(n, words[-n:]) for n in (3, 2, 1)]:  # rad_per_s, rad_s, rad
         if unit or len(words) <= length or ({*words[-length:]} <= {*own} and words.count(words[-1]) == 1):
             continue  # position_A1, unlike A1_current_A
-        if word := unit_of(pieces):
+        if word := spell_unit(pieces):
             unit, words = word, words[:-length]
     return unit, words, numbers
 
@@ -227,12 +227,12 @@ _MARKS = {"format", "gripper", "pulsed", "registers", "short", "side"}  # kinds 
 _WHERE = {"angle", "length", "place"}
 
 
-def _flags(words: list[str], unit: str) -> tuple[set[str], list[str]]:
+def _find_flags(words: list[str], unit: str) -> tuple[set[str], list[str]]:
     """What the rules of ``column_names.toml`` ask for, and the words that say nothing of a quantity."""
-    known, flags, rest = vocabulary().kinds, set[str](), list[str]()
+    known, flags, rest = read_vocabulary().kinds, set[str](), list[str]()
     for word in words:
         kinds = known.get(word, set()) - _MARKS
-        if not kinds and (whole := _derived_from(word)):
+        if not kinds and (whole := _find_derived(word)):
             kinds = {"speed"} | (known[whole] & {"angle", "length"})
         flags |= kinds
         if not kinds and "format" not in known.get(word, ()):
@@ -256,20 +256,20 @@ def _holds(rule: str, flags: set[str]) -> bool:
     return all((token.lstrip("!") in flags) != token.startswith("!") for token in rule.split())
 
 
-def _derived_from(word: str) -> str:
+def _find_derived(word: str) -> str:
     """The position whose derivative a word is by a mark: dq, qd, thetadot; "" for none."""
-    known = vocabulary().kinds
+    known = read_vocabulary().kinds
     inner = (word.removeprefix("d"), *(word.removesuffix(end) for end in ("dot", "d", "p")))
     return next((one for one in inner if one != word and known.get(one, set()) & _WHERE), "")
 
 
-def _axis(words: list[str]) -> str:
+def _find_axis(words: list[str]) -> str:
     """The axis of a vector's or quaternion's component: pos_x, qw, px."""
     last = words[-1] if words else ""
     return last[-1] if re.fullmatch("[qprvwga]?[xyzw]", last) else ""
 
 
-def _without_axis(column: str, last: str) -> str:
+def _drop_axis(column: str, last: str) -> str:
     """The name without the axis that its last word ends with, whatever unit comes after it."""
     piece = [piece for piece in _PIECE.finditer(column) if piece[0].lower() == last][-1]
     return column[: piece.end() - 1] + column[piece.end() :]
@@ -282,14 +282,14 @@ def _is_quaternion(words: list[str]) -> bool:
 def alike(words: Collection[str], *names: str) -> float:
     """How much of a name of the model stands in a column's words, from 0 to 1, of the likest; spelt shorter counts."""
     out = [0.0]
-    for own in map(words_of, names):
+    for own in map(split_words, names):
         if own and words:
-            out.append(sum(max(_similar(a, b) for b in words) for a in own) / len(own))
+            out.append(sum(max(_compare(a, b) for b in words) for a in own) / len(own))
     return max(out)
 
 
 @functools.cache
-def _similar(a: str, b: str) -> float:
+def _compare(a: str, b: str) -> float:
     short, long = sorted((a, b), key=len)
     if a == b:
         return 1.0

@@ -36,7 +36,7 @@ from sipe_bayes.calibration.config_tables import Columns as Named
 from sipe_bayes.calibration.config_tables import Command, LogEntry, Measurement
 from sipe_bayes.calibration.grid import Grid, Recording, Series, control_grid, held, sampled
 from sipe_bayes.calibration.log_report import report_of
-from sipe_bayes.calibration.readers.base import Columns, LogError, as_numbers, too_many
+from sipe_bayes.calibration.readers.base import Columns, LogError, is_text, read_numbers
 from sipe_bayes.calibration.readers.many import clock_of, combined, digest, episode, episode_numbers, with_clock
 from sipe_bayes.calibration.readers.tables import read_table
 from sipe_bayes.core.arrays import FloatArray, IntArray
@@ -299,10 +299,10 @@ def _column(config: Config, log: LogEntry, table: Columns, name: str, remedy: st
     if name not in table:
         where = f"key `{_key_of(config, name)}`: no column {name!r} in {log.file.name}"
         raise LogError(f"{where}; {nearest(name, table)}{remedy}")
-    numbers = as_numbers(table[name])
-    if numbers and not too_many(numbers[1], len(numbers[0])):
+    numbers = read_numbers(table[name])
+    if numbers and not is_text(numbers[1], len(numbers[0])):
         return numbers[0]
-    cells = (row for row in enumerate(table[name], 1) if as_numbers(np.array([row[1]], dtype=object)) is None)
+    cells = (row for row in enumerate(table[name], 1) if read_numbers(np.array([row[1]], dtype=object)) is None)
     row, cell = next(cells, (1, table[name][:1]))
     where = f"column {name!r} holds {reprlib.repr(cell)} in row {row}"
     raise LogError(f"{where}, expected numbers; correct it or leave it blank")

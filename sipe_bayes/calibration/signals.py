@@ -44,12 +44,12 @@ def slope_of(position: FloatArray, velocity: FloatArray, dt: float = 1.0) -> Slo
     way = (position[span:] - position[:-span]) / (span * dt)
     total = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]))])
     mean = (total[span:] - total[:-span]) / span
-    shares = np.array([_explained(way, mean, lag) for lag in range(-2, min(_LATEST, len(way) // 4) + 1)])
+    shares = np.array([_explain(way, mean, lag) for lag in range(-2, min(_LATEST, len(way) // 4) + 1)])
     best = int(np.argmax(shares))
     lag = float(best - 2)
     if 0 < best < len(shares) - 1 and (bend := shares[best - 1] - 2 * shares[best] + shares[best + 1]) < 0:
         lag += 0.5 * (shares[best - 1] - shares[best + 1]) / bend
-    a, b = _shifted(way, mean, best - 2)
+    a, b = _shift(way, mean, best - 2)
     # the geometric mean of both regressions, so that noise of either does not shrink it
     factor = float(np.sign(a @ b) * np.sqrt((a @ a) / max(float(b @ b), 1e-300))) or 1.0
     return Slope(factor, float(shares[best]), lag)
@@ -61,18 +61,18 @@ def likeness(command: FloatArray, measured: FloatArray) -> Likeness:
     a, b = command[known], measured[known]
     if len(a) < _FEWEST or np.ptp(a) == 0 or np.ptp(b) == 0:
         return Likeness(1.0, 0.0)
-    shares = [_explained(a, b, lag) for lag in range(min(_LATEST, len(a) // 4))]
-    x, y = _shifted(a, b, best := int(np.argmax(shares)))
+    shares = [_explain(a, b, lag) for lag in range(min(_LATEST, len(a) // 4))]
+    x, y = _shift(a, b, best := int(np.argmax(shares)))
     return Likeness(float(x @ y) / max(float(y @ y), 1e-300), float(shares[best]))
 
 
-def _shifted(way: FloatArray, mean: FloatArray, lag: int) -> tuple[FloatArray, FloatArray]:
+def _shift(way: FloatArray, mean: FloatArray, lag: int) -> tuple[FloatArray, FloatArray]:
     a, b = (way[: len(way) - lag], mean[lag:]) if lag >= 0 else (way[-lag:], mean[:lag])
     return a - a.mean(), b - b.mean()
 
 
-def _explained(way: FloatArray, mean: FloatArray, lag: int) -> float:
-    a, b = _shifted(way, mean, lag)
+def _explain(way: FloatArray, mean: FloatArray, lag: int) -> float:
+    a, b = _shift(way, mean, lag)
     size = float((a @ a) * (b @ b))
     return float((a @ b) ** 2 / size) if size > 0 else 0.0
 

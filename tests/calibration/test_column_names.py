@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sipe_bayes.calibration.column_names import Kind, alike, read_name, vocabulary
+from sipe_bayes.calibration.column_names import Kind, alike, read_name, read_vocabulary
 from sipe_bayes.calibration.config_fields import ConfigError
 
 
@@ -67,7 +67,7 @@ def users_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     (tmp_path / "sipe_bayes").mkdir()
     yield tmp_path / "sipe_bayes" / "column_names.toml"
-    vocabulary.cache_clear()
+    read_vocabulary.cache_clear()
 
 
 def test_a_users_file_comes_first(users_file: Path) -> None:
@@ -77,7 +77,7 @@ def test_a_users_file_comes_first(users_file: Path) -> None:
         units = { deg = "gr" }
         patterns = { "plc.*.{joint}_act" = "position mrad" }"""
     )
-    vocabulary.cache_clear()
+    read_vocabulary.cache_clear()
     assert (read_name("hoek_2_gr").kind, read_name("hoek_2_gr").unit) == (Kind.POSITION, "deg")
     assert read_name("x").kind == Kind.OTHER
     label = read_name("plc.unit4.elbow_act")
@@ -97,7 +97,7 @@ def test_a_users_file_comes_first(users_file: Path) -> None:
 )  # fmt: skip
 def test_a_wrong_users_file_is_named_in_one_line(text: str, message: str, users_file: Path) -> None:
     users_file.write_text(text)
-    vocabulary.cache_clear()
+    read_vocabulary.cache_clear()
     with pytest.raises(ConfigError) as caught:
         read_name("q")
     assert str(users_file) in str(caught.value)

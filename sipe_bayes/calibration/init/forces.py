@@ -66,18 +66,18 @@ def with_forces(
     sizes = len(first) > 1 and not (measured < 0).any()
     readings = []
     for reading, values in zip(first, measured.T, strict=True):
-        force = seen[:, int(model.joint(_joint(reading)).dofadr[0])]
+        force = seen[:, int(model.joint(_find_joint(reading)).dofadr[0])]
         both_ways = min(np.mean(force > 0), np.mean(force < 0)) > _BOTH_WAYS
         if (both_ways or sizes) and not (values < 0).any():
             notes.append(f"{reading.match.column!r} is not used: it never changes its sign")
             continue
-        decided = _decided(reading, force, values)
+        decided = _decide(reading, force, values)
         readings += [decided] if decided.fit else []
         notes += [] if decided.fit else [f"{reading.match.column!r} is not used: {note}" for note in decided.notes]
     return replace(draft, measurements=(*draft.measurements, *readings)), notes
 
 
-def _decided(reading: Reading, force: FloatArray, measured: FloatArray) -> Reading:
+def _decide(reading: Reading, force: FloatArray, measured: FloatArray) -> Reading:
     """With the sign and the unit in which it is about as large as the model's force; not fitted where it is in none.
 
     The factor is that of the spreads of both (n,), which noise of either does not shrink.
@@ -91,7 +91,7 @@ def _decided(reading: Reading, force: FloatArray, measured: FloatArray) -> Readi
     words = [own.word] if reading.match.label.unit else unit_words(own.dimension)
     times = {word: ratio * find_unit(word).factor / own.factor for word in words}
     unit = min(words, key=lambda word: abs(np.log(times[word])))
-    off, joint = abs(float(np.log(times[unit]))), _joint(reading)
+    off, joint = abs(float(np.log(times[unit]))), _find_joint(reading)
     note = f"the model's force at {joint} explains {100 * alike**2:.0f} % of its variance"
     if alike**2 < _FOLLOWS:
         return replace(reading, fit=False, notes=(note,))
@@ -104,5 +104,5 @@ def _decided(reading: Reading, force: FloatArray, measured: FloatArray) -> Readi
     return replace(reading, notes=(note,))
 
 
-def _joint(reading: Reading) -> str:
+def _find_joint(reading: Reading) -> str:
     return reading.match.target.removeprefix("joint:").removesuffix(".force")

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.optimize
 
-from sipe_bayes.calibration.column_names import Kind, Label, alike, pieces_of, read_name, unit_of, vocabulary
+from sipe_bayes.calibration.column_names import Kind, Label, alike, pieces_of, read_name, read_vocabulary, spell_unit
 from sipe_bayes.calibration.machine import Drive, Machine
 from sipe_bayes.calibration.signals import slope_of
 from sipe_bayes.core.arrays import FloatArray
@@ -95,34 +95,34 @@ _DRIVING = {Kind.COMMAND, Kind.SETPOINT, Kind.SPEED_SETPOINT, Kind.TORQUE, Kind.
 
 def match_columns(machine: Machine, table: Table) -> Matches:
     """Match varying columns to a model; table: column -> (n,) numbers of one log, without its clocks."""
-    own = _own_words(machine)
+    own = _find_own_words(machine)
     labels = [read_name(name, own) for name in table]
     labels = [replace(x, kind=Kind.UNKNOWN) if x.kind == Kind.TIME and _falls(table[x.column]) else x for x in labels]
     labels = [label for label in labels if label.kind not in (Kind.TIME, Kind.EPISODE)]
-    vectors, labels, open_vectors = _vectors(machine, labels)
-    labels, of_tendons = _without_tendons(machine, labels)
-    targets = _targets(machine)
-    named = {m.column: m.label.kind for m in _assigned(machine, labels, targets)[0]}
+    vectors, labels, open_vectors = _match_vectors(machine, labels)
+    labels, of_tendons = _leave_out_tendons(machine, labels)
+    targets = _list_targets(machine)
+    named = {m.column: m.label.kind for m in _assign(machine, labels, targets)[0]}
     labels = [replace(x, kind=named.get(x.column, x.kind)) if x.kind == Kind.UNKNOWN else x for x in labels]
     labels = [replace(x, kind=Kind.OTHER) if x.kind == Kind.UNKNOWN and x.unit == "%" else x for x in labels]
     unnamed = [label for label in labels if label.kind == Kind.UNKNOWN]
-    labels, open_commands = _unravelled(machine, labels, table)
-    matches, rivals = _assigned(machine, labels, targets)
+    labels, open_commands = _unravel(machine, labels, table)
+    matches, rivals = _assign(machine, labels, targets)
     used = {match.column for match in matches}
     torques = {m.target for m in matches if m.label.kind == Kind.TORQUE}
     driven = {m.target for m in matches} - torques
     joints = {a.joint.name for a in machine.actuators if a.joint and f"actuator:{a.name}" in driven}
     felt = [x for x in labels if x.kind == Kind.TORQUE and x.column not in used and not x.commanded]
-    forces, _ = _assigned(machine, felt, [t for t in _targets(machine, "force") if t.names[0] in joints])
+    forces, _ = _assign(machine, felt, [t for t in _list_targets(machine, "force") if t.names[0] in joints])
     positions = [m for m in matches if m.target.endswith(".position")]
-    velocities = _by_slopes(positions, [m for m in matches if m.target.endswith(".velocity")], table)
+    velocities = _exchange_velocities(positions, [m for m in matches if m.target.endswith(".velocity")], table)
     commands = [m for m in matches if m.target.startswith("actuator:")]
     moving = [x for x in unnamed if x.column not in used and _falls(table[x.column])]
     if positions:  # pendel_winkel for a pivot; what only rises counts something
-        positions += _only_one(moving, [t for t in targets if t.quantity == "position"], positions, Kind.POSITION)
+        positions += _match_last(moving, [t for t in targets if t.quantity == "position"], positions, Kind.POSITION)
     driving = [x for x in labels if x.commanded and x.kind in {*_DRIVING, Kind.CURRENT, Kind.VOLTAGE}]
     driving = [x for x in driving if x.column not in used]
-    commands += _only_one(driving, [t for t in targets if t.drive], commands)
+    commands += _match_last(driving, [t for t in targets if t.drive], commands)
     rivals = [rival for rival in rivals if rival.column not in {m.column for m in (*positions, *velocities, *commands)}]
     everything = (*positions, *velocities, *commands, *vectors, *forces)
     used = {column for match in everything for column in match.columns}
@@ -133,12 +133,12 @@ def match_columns(machine: Machine, table: Table) -> Matches:
     )
 
 
-def _own_words(machine: Machine) -> set[str]:
+def _find_own_words(machine: Machine) -> set[str]:
     """Words of quantities that are none here: a joint is called so, or nothing has an inertial unit.
 
     ``drive`` is a joint's where no actuator is called so; units of pressures are, where a joint is called so.
     """
-    words = vocabulary()
+    words = read_vocabulary()
     commands = words.of("command") - {actuator.name for actuator in machine.actuators}
     gauges = {word for word, unit in words.units.items() if unit in ("bar", "mbar", "Pa", "kPa", "MPa", "kg")}
     own = {p for joint in machine.joints for p in pieces_of(joint.name)} & (words.of("short") | commands | gauges)
@@ -155,7 +155,7 @@ def _falls(values: FloatArray) -> bool:
     return bool((steps < 0).sum() > 0.01 * max(1, (steps != 0).sum()))
 
 
-def _targets(machine: Machine, *quantities: str) -> list[_Target]:
+def _list_targets(machine: Machine, *quantities: str) -> list[_Target]:
     """Of the joints and actuators."""
     joints = [
         _Target(f"joint:{j.name}.{quantity}", quantity, (j.name, j.body), j.rank, j.hinge)
@@ -172,12 +172,12 @@ def _targets(machine: Machine, *quantities: str) -> list[_Target]:
     return joints + actuators * (not quantities)
 
 
-def _assigned(machine: Machine, labels: Sequence[Label], targets: Sequence[_Target]) -> tuple[list[Match], list[Match]]:
+def _assign(machine: Machine, labels: Sequence[Label], targets: Sequence[_Target]) -> tuple[list[Match], list[Match]]:
     """Columns with the targets that fit best together, in the targets' order; and rivals of those that drive."""
     if not labels or not targets:
         return [], []
-    places = _places(labels)
-    kinds = [[_taken_as(machine, x, t) for t in targets] for x in labels]
+    places = _find_places(labels)
+    kinds = [[_find_kind(machine, x, t) for t in targets] for x in labels]
     counts = [sum(t.quantity == other.quantity for other in targets) for t in targets]
     scores = np.full((len(labels), len(targets)), -np.inf)
     base = np.zeros_like(scores)
@@ -185,7 +185,7 @@ def _assigned(machine: Machine, labels: Sequence[Label], targets: Sequence[_Targ
         if taken := kinds[i][j]:
             order = 0.002 * i - 1e-6 * i * j  # where names do not decide, columns come in the order of the targets
             fit = _FITS[t.drive or t.quantity][taken] - (0.3 if t.drive else -0.05) * x.measured
-            scores[i, j] = fit + _affinity(x, t, places.get(x.column), counts[j]) - order
+            scores[i, j] = fit + _score_names(x, t, places.get(x.column), counts[j]) - order
             felt = t.drive and not x.commanded and x.kind != Kind.DUTY  # it may be measured at the drive
             by_name = taken != x.kind or fit <= _NEVER or (felt and x.measured)
             base[i, j] = 4.0 if by_name else 12.0 if felt else 20.0  # what comes first, whatever it is called
@@ -196,7 +196,7 @@ def _assigned(machine: Machine, labels: Sequence[Label], targets: Sequence[_Targ
     matches, rivals = [], []
     for j, i in pairs:
         x, t = replace(labels[i], kind=kinds[i][j] or labels[i].kind), targets[j]
-        surety, named = _sure(x, targets, scores, i, j), alike(x.words, *t.names) > 0
+        surety, named = _rate_pair(x, targets, scores, i, j), alike(x.words, *t.names) > 0
         matches.append(Match((x.column,), t.name, x, surety, named=named))
         for k in np.argsort(-scores[:, j]) if targets[j].drive else ():
             rival = k not in taken_rows and kinds[k][j] == labels[k].kind
@@ -205,7 +205,7 @@ def _assigned(machine: Machine, labels: Sequence[Label], targets: Sequence[_Targ
     return matches, rivals
 
 
-def _sure(label: Label, targets: Sequence[_Target], scores: FloatArray, i: int, j: int) -> float:
+def _rate_pair(label: Label, targets: Sequence[_Target], scores: FloatArray, i: int, j: int) -> float:
     """By how much target j is better for column i than the next best of its quantity."""
     same = [k for k, target in enumerate(targets) if target.quantity == targets[j].quantity]
     drives = targets[j].drive is not None
@@ -216,7 +216,7 @@ def _sure(label: Label, targets: Sequence[_Target], scores: FloatArray, i: int, 
     return float(min(scores[i, j], scores[i, j] - max(others)) if others else scores[i, j] + 0.5)
 
 
-def _taken_as(machine: Machine, label: Label, target: _Target) -> Kind | None:
+def _find_kind(machine: Machine, label: Label, target: _Target) -> Kind | None:
     """The kind of quantity that a column would be for a target; None where it can not be."""
     fits = _FITS[target.drive or target.quantity]
     if label.kind in fits:
@@ -233,7 +233,7 @@ def _taken_as(machine: Machine, label: Label, target: _Target) -> Kind | None:
     return becomes if whole or called else None
 
 
-def _places(labels: Sequence[Label]) -> dict[str, int]:
+def _find_places(labels: Sequence[Label]) -> dict[str, int]:
     """Of a column with a number, its place within its family, counted from 0."""
     families: dict[str, set[int]] = defaultdict(set)
     numbered = [(x, x.number) for x in labels if x.number is not None]
@@ -242,7 +242,7 @@ def _places(labels: Sequence[Label]) -> dict[str, int]:
     return {x.column: sorted(family).index(n) for x, n in numbered if len(family := families[x.stem]) > 1}
 
 
-def _affinity(label: Label, target: _Target, place: int | None, count: int) -> float:
+def _score_names(label: Label, target: _Target, place: int | None, count: int) -> float:
     """How well a column's name, number and unit fit a target."""
     out = []
     for k, name in enumerate(target.names):
@@ -270,7 +270,7 @@ def is_exactly(label: Label, name: str) -> bool:
     return bool(own) and own <= {*pieces_of(label.column)} and {*label.words} <= own and number <= own
 
 
-def _only_one(
+def _match_last(
     labels: Sequence[Label], targets: Sequence[_Target], matches: Sequence[Match], kind: Kind | None = None
 ) -> list[Match]:
     """The one column that is left, whatever it is called, for the one target that is."""
@@ -281,7 +281,7 @@ def _only_one(
     return [Match((labels[0].column,), bare[0].name, replace(labels[0], kind=kind or labels[0].kind), score)]
 
 
-def _by_slopes(positions: Sequence[Match], velocities: Sequence[Match], table: Table) -> list[Match]:
+def _exchange_velocities(positions: Sequence[Match], velocities: Sequence[Match], table: Table) -> list[Match]:
     """Velocities exchanged among the joints, and those without a name given to others, where slopes tell so."""
     places = {m.target.removesuffix("position") + "velocity": table[m.column] for m in positions}
     targets = list(dict.fromkeys([*(m.target for m in velocities), *places]))
@@ -295,7 +295,7 @@ def _by_slopes(positions: Sequence[Match], velocities: Sequence[Match], table: T
     return [replace(velocities[i], target=targets[j]) for j, i in pairs]
 
 
-def _without_tendons(machine: Machine, labels: list[Label]) -> tuple[list[Label], list[str]]:
+def _leave_out_tendons(machine: Machine, labels: list[Label]) -> tuple[list[Label], list[str]]:
     """Labels of which those called as an actuator of a tendon, and as no joint, measure no joint; and what they may."""
     pulling = [actuator.name for actuator in machine.actuators if actuator.tendon and actuator.joint is None]
     joints = [name for joint in machine.joints for name in (joint.name, joint.body)]
@@ -309,7 +309,7 @@ def _without_tendons(machine: Machine, labels: list[Label]) -> tuple[list[Label]
     return [replace(x, kind=Kind.OTHER) if x.column in away else x for x in labels], [doubt] * bool(away)
 
 
-def _unravelled(machine: Machine, labels: list[Label], table: Table) -> tuple[list[Label], list[str]]:
+def _unravel(machine: Machine, labels: list[Label], table: Table) -> tuple[list[Label], list[str]]:
     """Labels with kinds for columns whose names say none, by their number and by what is whose slope; and doubts."""
     families: dict[str, list[Label]] = defaultdict(list)
     for label in sorted((x for x in labels if x.kind == Kind.UNKNOWN), key=lambda x: x.number or 0):
@@ -322,12 +322,12 @@ def _unravelled(machine: Machine, labels: list[Label], table: Table) -> tuple[li
         kind = Kind.VELOCITY if max(shares, default=0.0) > 0.8 else Kind.SETPOINT if desired else Kind.OTHER
         known[label.column] = replace(label, kind=kind)
     states = [s for s, f in families.items() if count and not positions and len(f) in (count, 2 * count)]
-    driving, doubts = _driving(machine, {s: f for s, f in families.items() if s not in states}, labels)
+    driving, doubts = _find_driving(machine, {s: f for s, f in families.items() if s not in states}, labels)
     for stem, family in families.items():
         kinds = [Kind.COMMAND if stem == driving else Kind.OTHER] * len(family)
         if stem in states:
             values = [table[x.column] for x in family]
-            pairs, blocks = _slopes(values, 2, 1), _slopes(values, 1, count)
+            pairs, blocks = _sum_slopes(values, 2, 1), _sum_slopes(values, 1, count)
             both = [Kind.POSITION, Kind.VELOCITY]
             woven = count > 1 and len(family) > count and pairs > blocks
             kinds = both * count if woven else [kind for kind in both for _ in range(count)]
@@ -337,13 +337,13 @@ def _unravelled(machine: Machine, labels: list[Label], table: Table) -> tuple[li
     return list(known.values()), doubts
 
 
-def _slopes(values: Sequence[FloatArray], step: int, ahead: int) -> float:
+def _sum_slopes(values: Sequence[FloatArray], step: int, ahead: int) -> float:
     """How well each column ``ahead`` of another is its slope."""
     pairs = [(values[i], values[i + ahead]) for i in range(0, len(values) - ahead, step)][: len(values) // 2]
     return sum(slope_of(p, v).share for p, v in pairs)
 
 
-def _driving(
+def _find_driving(
     machine: Machine, families: Mapping[str, list[Label]], labels: Sequence[Label]
 ) -> tuple[str | None, list[str]]:
     """The stem of the family that is taken for commands, since it has a column for each actuator; and doubts."""
@@ -362,7 +362,7 @@ def _driving(
     return chosen, [f"{text}{rivals or '; check it'}"]
 
 
-def _vectors(machine: Machine, labels: list[Label]) -> tuple[list[Match], list[Label], list[str]]:
+def _match_vectors(machine: Machine, labels: list[Label]) -> tuple[list[Match], list[Label], list[str]]:
     """Poses of free bodies and readings of inertial sensors, of three or four columns; other labels; and doubts."""
     groups: dict[str, list[Label]] = defaultdict(list)
     for label in labels:
@@ -373,7 +373,7 @@ def _vectors(machine: Machine, labels: list[Label]) -> tuple[list[Match], list[L
     out: dict[str, Match] = {}
     for (target, kind), (stem, group) in itertools.product(wanted if machine.bodies else wanted[:-4], groups.items()):
         taken = {column for match in out.values() for column in match.columns}
-        fitting = [x for x in group if x.column not in taken and kind in _components(machine, x, stem)]
+        fitting = [x for x in group if x.column not in taken and kind in _find_vectors(machine, x, stem)]
         size, score = 4 if kind == "orientation" else 3, SURE
         if target == "body:":
             alikeness = {name: alike(read_name(stem).words, name) for name in machine.bodies}
@@ -387,7 +387,7 @@ def _vectors(machine: Machine, labels: list[Label]) -> tuple[list[Match], list[L
         columns = tuple(sorted(at, key=at.__getitem__))
         label = next(x for x in fitting if x.column == columns[0])
         out[target] = Match(columns, target, label, score if label.axis or size == 3 else 0.0, order * (size == 4))
-    reasons = {target: _two_ways(match.label, target) for target, match in out.items()}
+    reasons = {target: _doubt_velocity(match.label, target) for target, match in out.items()}
     doubts = []
     for target, why in reasons.items():
         other = target.replace("angular", "~").replace("linear", "angular").replace("~", "linear")
@@ -398,49 +398,49 @@ def _vectors(machine: Machine, labels: list[Label]) -> tuple[list[Match], list[L
     return list(out.values()), [x for x in labels if x.column not in taken], doubts
 
 
-def _components(machine: Machine, label: Label, stem: str) -> set[str]:
+def _find_vectors(machine: Machine, label: Label, stem: str) -> set[str]:
     """The vectors of which a column may be a component, by its name and that without its axis."""
     if label.kind == Kind.ACCELERATION:
-        return {"accelerometer"} if _speaks(stem, "acc", "linear") or _ends(stem, "a") else set()
+        return {"accelerometer"} if _has_any(stem, "acc", "linear") or _ends_with(stem, "a") else set()
     if label.kind == Kind.VELOCITY:
-        gyro = {"gyro"} if _speaks(stem, "gyro", "omega", "ang") or _ends(stem, "g") else set()
+        gyro = {"gyro"} if _has_any(stem, "gyro", "omega", "ang") or _ends_with(stem, "g") else set()
         return {"angular_velocity" if _is_spin(label, stem) else "linear_velocity", *gyro}
-    spelt = _speaks(stem, "quat", "orientation") or (not machine.joints and pieces_of(stem)[-1:] == ["q"])
+    spelt = _has_any(stem, "quat", "orientation") or (not machine.joints and pieces_of(stem)[-1:] == ["q"])
     if label.kind == Kind.QUATERNION or (spelt and label.number is not None):
         return {"orientation"}
     return {"position"} if label.kind == Kind.POSITION else set()
 
 
-def _speaks(stem: str, *words: str) -> bool:
+def _has_any(stem: str, *words: str) -> bool:
     return any(word in stem.lower() for word in words)
 
 
-def _ends(stem: str, letter: str) -> bool:
+def _ends_with(stem: str, letter: str) -> bool:
     """Whether a component's name, without its axis and unit, ends with a letter."""
     pieces = pieces_of(stem)
-    while len(pieces) > 1 and pieces[-1] != letter and (pieces[-1] in ("per", "2") or unit_of(pieces[-1:])):
+    while len(pieces) > 1 and pieces[-1] != letter and (pieces[-1] in ("per", "2") or spell_unit(pieces[-1:])):
         pieces.pop()
     return pieces[-1:] == [letter]
 
 
 def _is_spin(label: Label, stem: str) -> bool:
     """Whether a velocity is an angular one."""
-    if label.unit or _speaks(stem, "ang", "omega", "gyro"):
+    if label.unit or _has_any(stem, "ang", "omega", "gyro"):
         return not label.unit or label.unit.startswith(("rad", "deg", "rev", "rpm"))
-    if vocabulary().of("about").intersection(pieces_of(label.column)):
-        return not _speaks(stem, "lin")
-    return bool({"w", "g"} & {*pieces_of(stem)}) and not _speaks(stem, "vel", "lin")  # beside these `w` is the frame
+    if read_vocabulary().of("about").intersection(pieces_of(label.column)):
+        return not _has_any(stem, "lin")
+    return bool({"w", "g"} & {*pieces_of(stem)}) and not _has_any(stem, "vel", "lin")  # beside these `w` is the frame
 
 
-def _two_ways(label: Label, target: str) -> str:
+def _doubt_velocity(label: Label, target: str) -> str:
     """Why the velocity of a body that a component's name was taken for may be another one; "" where it is clear."""
     pieces = {*pieces_of(label.column)}
-    if not target.startswith("body:") or label.kind != Kind.VELOCITY or _speaks(label.vector, "ang", "omega"):
+    if not target.startswith("body:") or label.kind != Kind.VELOCITY or _has_any(label.vector, "ang", "omega"):
         return ""
     if {"gx", "gy", "gz"} & pieces:
         return "a gyro tells it in the body's own axes: if it is one, give the model a <gyro>"
-    glued, linear = vocabulary().of("about") & pieces, _speaks(label.vector, "lin")
-    if label.unit or not (linear or _speaks(label.vector, "vel")) or not (glued or ("w" in pieces and not linear)):
+    glued, linear = read_vocabulary().of("about") & pieces, _has_any(label.vector, "lin")
+    if label.unit or not (linear or _has_any(label.vector, "vel")) or not (glued or ("w" in pieces and not linear)):
         return ""
     other = "linear" if target.endswith("angular_velocity") else "angular"
     return f"or are they its {other} velocity, since `w` is the world as well as a rate?"

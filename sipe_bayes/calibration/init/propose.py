@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from sipe_bayes.calibration.column_names import pieces_of, vocabulary
+from sipe_bayes.calibration.column_names import pieces_of, read_vocabulary
 from sipe_bayes.calibration.init.cases import Source, case_of, gyros_of, rough_unknowns, tried_part
 from sipe_bayes.calibration.init.decisions import (
     Case,
@@ -193,7 +193,7 @@ def _check_some(machine: Machine, matches: Matches, opened: Opened, file: Path) 
 
 def _resolved(opened: Opened) -> list[str]:
     """What is to be said of columns that are cosines and sines."""
-    columns = [column for column in opened.columns if vocabulary().of("resolved") & {*pieces_of(column)}]
+    columns = [column for column in opened.columns if read_vocabulary().of("resolved") & {*pieces_of(column)}]
     if not columns:
         return []
     return [

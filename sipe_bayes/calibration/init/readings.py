@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sipe_bayes.calibration.column_names import Kind, Label, pieces_of, read_name, vocabulary
+from sipe_bayes.calibration.column_names import Kind, Label, pieces_of, read_name, read_vocabulary
 from sipe_bayes.calibration.init.draft import Reading, Scale
 from sipe_bayes.calibration.init.matching import Match, Matches
 from sipe_bayes.calibration.init.tables import Clock
@@ -52,62 +52,62 @@ def first_readings(
     machine: Machine, matches: Matches, table: Table, turns: Mapping[str, float], clock: Clock
 ) -> tuple[tuple[Reading, ...], tuple[Reading, ...]]:
     """Measurements and commands as names and numbers alone tell them."""
-    positions = [_position(machine, m, table, turns) for m in matches.positions]
-    positions = [_by_velocity(reading, matches, table, clock) for reading in _with_common_counts(positions, machine)]
-    vectors = [_vector(m, table) for m in matches.vectors]
-    velocities = [Reading(m, _unit(m, _joint_unit(machine, m, "/s"))) for m in matches.velocities]
+    positions = [_read_position(machine, m, table, turns) for m in matches.positions]
+    positions = [_use_velocity(reading, matches, table, clock) for reading in _share_counts(positions, machine)]
+    vectors = [_read_vector(m, table) for m in matches.vectors]
+    velocities = [Reading(m, _choose_unit(m, _find_joint_unit(machine, m, "/s"))) for m in matches.velocities]
     drives = {f"actuator:{actuator.name}": actuator for actuator in machine.actuators}
-    commands = [_command(drives[m.target], m, matches, table) for m in matches.commands]
-    commands = [_on_its_side(reading, drives[reading.match.target], table) for reading in commands]
-    positions, commands = _with_shares(positions, commands, machine, table)
+    commands = [_read_command(drives[m.target], m, matches, table) for m in matches.commands]
+    commands = [_turn_into_range(reading, drives[reading.match.target], table) for reading in commands]
+    positions, commands = _add_shares(positions, commands, machine, table)
     return (*positions, *velocities, *vectors), tuple(commands)
 
 
-def _joint_unit(machine: Machine, match: Match, per: str = "") -> str:
+def _find_joint_unit(machine: Machine, match: Match, per: str = "") -> str:
     joint = next(j for j in machine.joints if match.target.startswith(f"joint:{j.name}."))
     return ("rad" if joint.hinge else "m") + per
 
 
-def _unit(match: Match, default: str) -> str:
+def _choose_unit(match: Match, default: str) -> str:
     """The unit in the name where it is of the right kind."""
     named = match.label.unit
     return named if named in unit_words(find_unit(default).dimension) else default
 
 
-def _named(reading: Reading, unit: str) -> Reading:
+def _name_unit(reading: Reading, unit: str) -> Reading:
     """A reading as if its column's name said a unit, or none."""
     return replace(reading, match=replace(reading.match, label=replace(reading.match.label, unit=unit)))
 
 
-def _noted(reading: Reading, note: str) -> Reading:
+def _add_note(reading: Reading, note: str) -> Reading:
     return replace(reading, notes=(*reading.notes, note))
 
 
-def _doubted(reading: Reading, doubt: str, *instead: str) -> Reading:
+def _add_doubt(reading: Reading, doubt: str, *instead: str) -> Reading:
     return replace(reading, doubts=(*reading.doubts, doubt), instead=(*reading.instead, *instead))
 
 
-def _matched(match: Match) -> tuple[str, ...]:
+def _note_match(match: Match) -> tuple[str, ...]:
     how = "for the nearest name" if match.named else "by the order of names alone"
     return () if match.sure else (f"taken for {match.target} {how}",)
 
 
-def _position(machine: Machine, match: Match, table: Table, turns: Mapping[str, float]) -> Reading:
-    reading = Reading(match, _unit(match, _joint_unit(machine, match)), notes=_matched(match))
+def _read_position(machine: Machine, match: Match, table: Table, turns: Mapping[str, float]) -> Reading:
+    reading = Reading(match, _choose_unit(match, _find_joint_unit(machine, match)), notes=_note_match(match))
     if turn := turns.get(match.column):
         unit = {360.0: "deg", 2 * np.pi: "rad", 1.0: "rev"}[turn]
-        reading = _noted(reading, f"jumps by {turn:.5g} where it comes round: {unit}, jumps are taken out")
-        return replace(_named(reading, unit), unit=unit, wraps=True)
-    counts = _counts(table[match.column], match.label) if reading.unit == "rad" and not match.label.unit else ()
+        reading = _add_note(reading, f"jumps by {turn:.5g} where it comes round: {unit}, jumps are taken out")
+        return replace(_name_unit(reading, unit), unit=unit, wraps=True)
+    counts = _find_counts(table[match.column], match.label) if reading.unit == "rad" and not match.label.unit else ()
     if counts:
         return replace(reading, scales=counts).read_as(counts[0])
     if white_share(table[match.column]) < 0.05:
         note = "looks filtered: hardly any noise at its highest frequencies; its lag would count as a delay"
-        reading = _noted(reading, note)
+        reading = _add_note(reading, note)
     return reading
 
 
-def _counts(values: FloatArray, label: Label) -> tuple[Scale, ...]:
+def _find_counts(values: FloatArray, label: Label) -> tuple[Scale, ...]:
     """What whole numbers may be of a turn, the likeliest first; nothing for others.
 
     Of servos, which are at 0 in the middle of their turn, what stands in their tables.
@@ -116,16 +116,16 @@ def _counts(values: FloatArray, label: Label) -> tuple[Scale, ...]:
     span = float(np.ptp(known)) if len(known) else 0.0
     if span < 30 or (np.mod(known, 1) != 0).any():
         return ()
-    if vocabulary().of("registers").intersection(pieces_of(label.column)):
+    if read_vocabulary().of("registers").intersection(pieces_of(label.column)):
         servos = [n for n in _SERVO_COUNTS if known.min() >= 0 and known.max() < n]
         return (*(Scale("rev", 1 / n, None, n / 2) for n in servos), Scale("rev", 1 / _SERVO_COUNTS[0]))
     return tuple(Scale("rev", 1 / n) for n in _COUNTS if 0.01 < span / n < 12.0)
 
 
-def _with_common_counts(positions: Sequence[Reading], machine: Machine) -> list[Reading]:
+def _share_counts(positions: Sequence[Reading], machine: Machine) -> list[Reading]:
     """Positions of which columns that are called alike but for a side, as their joints are, count alike."""
     names = {f"joint:{joint.name}.position": joint.name for joint in machine.joints}
-    sides, pairs = vocabulary().of("side"), defaultdict[tuple[str, ...], list[int]](list)
+    sides, pairs = read_vocabulary().of("side"), defaultdict[tuple[str, ...], list[int]](list)
     for k, reading in enumerate(positions):
         pieces = pieces_of(f"{reading.match.column}_{names[reading.match.target]}")
         if reading.scales and sides.intersection(pieces):
@@ -138,7 +138,7 @@ def _with_common_counts(positions: Sequence[Reading], machine: Machine) -> list[
     return out
 
 
-def _by_velocity(reading: Reading, matches: Matches, table: Table, clock: Clock) -> Reading:
+def _use_velocity(reading: Reading, matches: Matches, table: Table, clock: Clock) -> Reading:
     """Where only the velocity's name has a unit, it tells that of the position too."""
     joint = reading.match.target.removesuffix("position")
     partner = next((m for m in matches.velocities if m.target == f"{joint}velocity"), None)
@@ -156,16 +156,16 @@ def _by_velocity(reading: Reading, matches: Matches, table: Table, clock: Clock)
     if slope.share < _FOLLOWS or not near:
         return reading
     unit, factor, *_ = near[0]
-    reading = _noted(reading, f"{near[0]}: {partner.column!r} in {partner.label.unit} is its slope")
+    reading = _add_note(reading, f"{near[0]}: {partner.column!r} in {partner.label.unit} is its slope")
     is_count = near[0] in reading.scales
-    return replace(reading if is_count else _named(reading, unit), factor=factor, unit=unit, scales=())
+    return replace(reading if is_count else _name_unit(reading, unit), factor=factor, unit=unit, scales=())
 
 
-def _vector(match: Match, table: Table) -> Reading:
+def _read_vector(match: Match, table: Table) -> Reading:
     """Poses and inertial sensors, whose units their sizes tell."""
     if match.quaternion and not match.label.axis:
         doubt = f"is the quaternion {match.quaternion} or xyzw? its columns do not say"
-        return _doubted(Reading(match, "1"), doubt, 'quaternion = "xyzw"')
+        return _add_doubt(Reading(match, "1"), doubt, 'quaternion = "xyzw"')
     if match.quaternion:
         return Reading(match, "1", notes=(f"a quaternion in the order {match.quaternion}, by its axes",))
     size = float(np.nanmedian(np.linalg.norm([table[c] for c in match.columns], axis=0)))
@@ -173,12 +173,12 @@ def _vector(match: Match, table: Table) -> Reading:
         unit = "g0" if 0.5 < size < 2.0 else "m/s^2"
         return Reading(match, unit, fit=False, notes=(f"{unit}: its usual length is {size:.3g}",))
     if match.label.kind == Kind.VELOCITY:
-        unit = _unit(match, "m/s" if match.target.endswith("linear_velocity") else "rad/s")
+        unit = _choose_unit(match, "m/s" if match.target.endswith("linear_velocity") else "rad/s")
         return Reading(match, unit, fit=False, notes=("starts windows; poses are fitted",))
-    return Reading(match, _unit(match, "m"), notes=_matched(match))
+    return Reading(match, _choose_unit(match, "m"), notes=_note_match(match))
 
 
-def _command(actuator: Actuator, match: Match, matches: Matches, table: Table) -> Reading:
+def _read_command(actuator: Actuator, match: Match, matches: Matches, table: Table) -> Reading:
     kind, named, shared = match.label.kind, match.label.unit, actuator.drive in _SHARED
     force = "N m" if actuator.turns else "N"
     winch = (actuator.tendon or actuator.thrust) and kind != Kind.TORQUE  # of what no gear tells
@@ -190,12 +190,12 @@ def _command(actuator: Actuator, match: Match, matches: Matches, table: Table) -
         Drive.VOLTAGE: {Kind.TORQUE: force, Kind.CURRENT: "A"}.get(kind, "V"),
         Drive.OTHER: "1",
     }[actuator.drive]
-    pulse = _pulse(table[match.column], actuator, match.label) if shared else None
+    pulse = _find_pulse(table[match.column], actuator, match.label) if shared else None
     if (named == "%" and shared) or kind == Kind.DUTY or pulse:
-        return _duty(match, actuator, table, pulse)
+        return _read_duty(match, actuator, table, pulse)
     fits = named in unit_words(find_unit(default).dimension) or (shared and named not in ("", "rad", "deg", "m", "mm"))
-    reading = Reading(match, named if named and fits else default, notes=_matched(match))
-    reading = reading if fits else _named(reading, "")
+    reading = Reading(match, named if named and fits else default, notes=_note_match(match))
+    reading = reading if fits else _name_unit(reading, "")
     place = next(
         (m for m in matches.positions if actuator.joint and m.target == f"joint:{actuator.joint.name}.position"), None
     )
@@ -206,15 +206,15 @@ def _command(actuator: Actuator, match: Match, matches: Matches, table: Table) -
                 f"it looks like a set-point of {place.column!r} ({100 * share:.0f} % of its variance), but "
                 f"{actuator.name} takes {actuator.drive.value}; make it a <position> actuator, or name the torque"
             )
-            reading = _doubted(reading, doubt)
+            reading = _add_doubt(reading, doubt)
     others = [m.column for m in matches.rivals if m.target == match.target][:3]
     if others:
         doubt = f"{match.column!r} or {', '.join(map(repr, others))}? both may drive {actuator.name}"
-        reading = _doubted(reading, doubt, *(f'column = "{other}"' for other in others))
+        reading = _add_doubt(reading, doubt, *(f'column = "{other}"' for other in others))
     return reading
 
 
-def _duty(match: Match, actuator: Actuator, table: Table, pulse: tuple[float, float] | None) -> Reading:
+def _read_duty(match: Match, actuator: Actuator, table: Table, pulse: tuple[float, float] | None) -> Reading:
     """A duty's scale, by its size, and the supply that it is a share of; pulse: as ``_pulse`` says."""
     values = table[match.column]
     largest, whole = float(np.nanmax(np.abs(values))), bool((np.mod(values[np.isfinite(values)], 1) == 0).all())
@@ -224,29 +224,29 @@ def _duty(match: Match, actuator: Actuator, table: Table, pulse: tuple[float, fl
     if match.label.unit == "%" or full == 100:
         reading = replace(reading, unit="%", factor=1.0)
     elif pulse:
-        reading = replace(_named(reading, ""), zero=pulse[0], factor=1 / pulse[1])
+        reading = replace(_name_unit(reading, ""), zero=pulse[0], factor=1 / pulse[1])
         size = f"a pulse in us, nothing at {pulse[0]:g} and all at {sum(pulse):g}, as a speed controller takes it"
-    reading = replace(reading, notes=(*_matched(match), f"a duty: {size}"))
+    reading = replace(reading, notes=(*_note_match(match), f"a duty: {size}"))
     factor, zero = reading.factor, reading.zero
     if zero and (values == 0).any():
         armed = f"{match.column!r} is 0 at times, as before a controller is armed, which is read as {-zero * factor:g}"
-        reading = _doubted(reading, f"{armed}: begin the logs later")
+        reading = _add_doubt(reading, f"{armed}: begin the logs later")
     voltages = [n for n in table if read_name(n).kind == Kind.SUPPLY and np.isfinite(table[n]).any()]
     supplied = float(np.nanmedian(table[voltages[0]])) if voltages else 0.0
     volts = ("mV", 1e-3) if supplied > _MILLIVOLTS else ("V", 1.0)
     if voltages and (actuator.limits is None or max(np.abs(actuator.limits)) >= supplied * volts[1] / 2):
-        return replace(_noted(reading, f"what arrives is it times {voltages[0]!r}"), supply=(voltages[0], volts[0]))
+        return replace(_add_note(reading, f"what arrives is it times {voltages[0]!r}"), supply=(voltages[0], volts[0]))
     if actuator.full is not None:
-        reading = _noted(reading, f"all of it is taken for {actuator.full:g}, where the model's ctrlrange ends")
+        reading = _add_note(reading, f"all of it is taken for {actuator.full:g}, where the model's ctrlrange ends")
         return replace(reading, factor=float(f"{factor * actuator.full:.6g}"))
     if actuator.drive != Drive.VOLTAGE:
         note = "all of it is one unit of control: the model has no ctrlrange from zero or the same to both sides"
-        return _noted(reading, note)
+        return _add_note(reading, note)
     doubt = f"a share of which voltage? no column tells; multiply `factor` by the supply's volts for {actuator.name}"
     return replace(reading, doubts=(doubt,), instead=(f"factor = {12 * factor:.6g}  # at 12 V",))
 
 
-def _pulse(values: FloatArray, actuator: Actuator, label: Label) -> tuple[float, float] | None:
+def _find_pulse(values: FloatArray, actuator: Actuator, label: Label) -> tuple[float, float] | None:
     """Of a command that is the width of a servo's or speed controller's pulse, in us: where it is none, and its span.
 
     One that is not in microseconds is, where its actuator's ctrlrange ends far below, or has none and it is a duty.
@@ -261,7 +261,7 @@ def _pulse(values: FloatArray, actuator: Actuator, label: Label) -> tuple[float,
     return (1500.0, 500.0) if both_ways else (1000.0, 1000.0)
 
 
-def _on_its_side(reading: Reading, actuator: Actuator, table: Table) -> Reading:
+def _turn_into_range(reading: Reading, actuator: Actuator, table: Table) -> Reading:
     """A command with the sign that the actuator's ctrlrange leaves it, where that lies on one side of zero."""
     if actuator.limits is None or not actuator.one_way:
         return reading
@@ -275,13 +275,13 @@ def _on_its_side(reading: Reading, actuator: Actuator, table: Table) -> Reading:
         return reading
     if lost < 1 - few and (values > noise).mean() > few:
         doubt = f"{100 * lost:.0f} % of it lie {text}: look at the range, and at where the command has its zero"
-        return _doubted(reading, doubt)
+        return _add_doubt(reading, doubt)
     turned = -values[values < 0]
     if reading.supply or np.mean((turned > (1 + _NEAR) * most) | (turned < (1 - _NEAR) * least)) < few:
         doubt = f"all of it lies {text}, and inside with the other sign, which is taken; check it"
-        return replace(_doubted(reading, doubt, "sign = 1"), sign=-1)
+        return replace(_add_doubt(reading, doubt, "sign = 1"), sign=-1)
     doubt = f"all of it lies {text}, and with the other sign too: look at the range and at the unit"
-    return _doubted(reading, doubt, "sign = -1")
+    return _add_doubt(reading, doubt, "sign = -1")
 
 
 def with_velocities(measurements: Sequence[Reading], table: Table, clock: Clock) -> tuple[Reading, ...]:
@@ -291,37 +291,37 @@ def with_velocities(measurements: Sequence[Reading], table: Table, clock: Clock)
         target = reading.match.target
         place = places.get(target.removesuffix("velocity") + "position") if target.startswith("joint:") else None
         moves = target.endswith(".velocity") and place is not None
-        out.append(_as_slope(reading, place, table, clock) if moves and place else reading)
+        out.append(_hold_against_slope(reading, place, table, clock) if moves and place else reading)
     return tuple(out)
 
 
-def _as_slope(reading: Reading, place: Reading, table: Table, clock: Clock) -> Reading:
+def _hold_against_slope(reading: Reading, place: Reading, table: Table, clock: Clock) -> Reading:
     """One velocity beside its position."""
     own, second, named = place.match.column, find_unit(clock.unit).factor, reading.match.label.unit
     slope, reading = slope_of(table[own], table[reading.match.column], clock.period), replace(reading, fit=False)
     if slope.share < _FOLLOWS:
         is_no_slope = f"it is not its slope ({100 * slope.share:.0f} % of the variance)"
         doubt = f"taken for the velocity of {own!r} by name, but {is_no_slope}; it only starts windows"
-        return _doubted(reading, doubt)
+        return _add_doubt(reading, doubt)
     wanted = slope.factor * place.sign * find_unit(place.unit).factor * place.factor / second / reading.factor
     words = unit_words(find_unit(reading.unit).dimension)
     word = min(words, key=lambda w: abs(np.log(abs(wanted) / find_unit(w).factor)))
     sign, near = 1 if wanted > 0 else -1, abs(wanted) / find_unit(word).factor
     times = f"the slope of {own!r} is {slope.factor:.4g} times it for each {clock.unit}"
-    reading = _noted(replace(reading, unit=word, sign=sign), f"{'-' if sign < 0 else ''}{word}: {times}")
+    reading = _add_note(replace(reading, unit=word, sign=sign), f"{'-' if sign < 0 else ''}{word}: {times}")
     if slope.lag > 1:
         late = 1e3 * slope.lag * clock.period * second
-        reading = _noted(reading, f"late by {slope.lag:.1f} samples ({late:.2g} ms), as a filter makes it")
-    reading = _noted(reading, "it starts windows and is not fitted: the position says the same")
+        reading = _add_note(reading, f"late by {slope.lag:.1f} samples ({late:.2g} ms), as a filter makes it")
+    reading = _add_note(reading, "it starts windows and is not fitted: the position says the same")
     if abs(np.log(near)) > _NEAR:
         other = "one of the two, or the clock, has another unit"
-        return _doubted(reading, f"{near:.3g} times the slope of {own!r} even in {word}: {other}")
+        return _add_doubt(reading, f"{near:.3g} times the slope of {own!r} even in {word}: {other}")
     if named and named != word and named in words:
-        return _doubted(reading, f"its name says {named}, but as the slope of {own!r} it is {word}")
+        return _add_doubt(reading, f"its name says {named}, but as the slope of {own!r} it is {word}")
     return reading
 
 
-def _with_shares(
+def _add_shares(
     positions: Sequence[Reading], commands: Sequence[Reading], machine: Machine, table: Table
 ) -> tuple[list[Reading], list[Reading]]:
     """Positions and set-points with the shares of a range that they may be, and read so where that is the likeliest."""
@@ -334,26 +334,26 @@ def _with_shares(
             follow = [i for i, other in enumerate(out) if servos.get(other.match.target) == joint]
             groups.append((joint, [k, *follow], [table[out[i].match.column] for i in (k, *follow)]))
     bodies = [columns for joint, members, columns in groups if not _grips(joint, out[members[0]])]
-    both_ways = lerobot and all(_within(values, BOTH_WAYS) for columns in bodies for values in columns)
+    both_ways = lerobot and all(_stays_within(values, BOTH_WAYS) for columns in bodies for values in columns)
     for joint, members, columns in groups:
         alike = [likeness(values, columns[0]) for values in columns[1:]]  # set-points that have the position's unit
         if not all(x.share > _FOLLOWS and abs(np.log(max(x.factor, 1e-9))) < np.log(1.4) for x in alike):
             continue
-        ends, likely = _ends_of(out[members[0]], joint, columns, lerobot, both_ways)
+        ends, likely = _find_ends(out[members[0]], joint, columns, lerobot, both_ways)
         says, share = _is_percent(out[members[0]]), Scale("rad" if joint.hinge else "m", 1.0, ends)
         for k in members if ends else ():
             reading = replace(out[k], shares=() if says else (share,), reach=joint.reach)
             if says:  # of which nothing else is asked
-                reading = _noted(replace(_named(reading, ""), scales=()), f"{share}, as its name says")
+                reading = _add_note(replace(_name_unit(reading, ""), scales=()), f"{share}, as its name says")
             out[k] = reading.read_as(share) if likely else reading
     return out[: len(positions)], out[len(positions) :]
 
 
 def _grips(joint: Joint, reading: Reading) -> bool:
-    return bool(vocabulary().of("gripper").intersection(pieces_of(f"{joint.name}_{reading.match.column}")))
+    return bool(read_vocabulary().of("gripper").intersection(pieces_of(f"{joint.name}_{reading.match.column}")))
 
 
-def _within(values: FloatArray, ends: tuple[float, float]) -> bool:
+def _stays_within(values: FloatArray, ends: tuple[float, float]) -> bool:
     """Whether a column stays within the ends, but for the 3 % by which a joint moves beyond its calibrated range."""
     known = values[np.isfinite(values)]
     return bool(known.size and known.min() >= ends[0] - 3 and known.max() <= ends[1] + 3)
@@ -361,14 +361,14 @@ def _within(values: FloatArray, ends: tuple[float, float]) -> bool:
 
 def _is_percent(reading: Reading) -> bool:
     """Whether a column's name says that it is a percentage."""
-    return "%" in (reading.match.label.unit, *(vocabulary().units.get(p) for p in pieces_of(reading.match.column)))
+    return "%" in (reading.match.label.unit, *(read_vocabulary().units.get(p) for p in pieces_of(reading.match.column)))
 
 
-def _ends_of(
+def _find_ends(
     reading: Reading, joint: Joint, columns: Sequence[FloatArray], lerobot: bool, both_ways: bool
 ) -> tuple[tuple[float, float] | None, bool]:
     """What a joint's columns may say at the ends of its range, and whether that is likelier than any unit."""
-    one_way = all(_within(values, PERCENT) for values in columns)
+    one_way = all(_stays_within(values, PERCENT) for values in columns)
     if _is_percent(reading):
         return PERCENT if one_way else BOTH_WAYS, True
     if reading.match.label.unit or max(float(np.nanmax(np.abs(values))) for values in columns) < 7:  # as well rad

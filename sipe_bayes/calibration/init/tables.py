@@ -11,7 +11,7 @@ import numpy as np
 
 from sipe_bayes.calibration.column_names import Kind, read_name
 from sipe_bayes.calibration.config_fields import listed
-from sipe_bayes.calibration.readers.base import Columns, LogError, as_numbers, too_many
+from sipe_bayes.calibration.readers.base import Columns, LogError, is_text, read_numbers
 from sipe_bayes.calibration.readers.many import clock_of, episode, episode_numbers, with_clock
 from sipe_bayes.calibration.readers.numbered import gathered, numbered
 from sipe_bayes.calibration.readers.tables import read_table
@@ -58,16 +58,16 @@ def open_table(path: Path, table: Columns, rate: float | None = None) -> Opened:
     table = with_clock(table, "time", rate)
     prefix = numbered(table, _EPISODES)
     table = table if prefix is None else gathered(table, prefix)
-    read = {name: own for name, column in table.items() if (own := as_numbers(column))}
-    numbers = {name: values for name, (values, lost) in read.items() if not too_many(lost, len(values))}
+    read = {name: own for name, column in table.items() if (own := read_numbers(column))}
+    numbers = {name: values for name, (values, lost) in read.items() if not is_text(lost, len(values))}
     lost = {name: lost for name, (_, lost) in read.items() if lost}
-    episodes = _episodes(numbers) if prefix is None else prefix
+    episodes = _find_episodes(numbers) if prefix is None else prefix
     if episodes is not None:
         ids = episode_numbers(path, table, episodes)
         values, counts = np.unique(ids, return_counts=True)
         one = episode({**numbers}, ids, int(values[np.argmax(counts)]))
         numbers = {name: np.asarray(own, dtype=np.float64) for name, own in one.items()}
-    clock = replace(_clock(path, numbers), rate=rate)
+    clock = replace(_find_clock(path, numbers), rate=rate)
     longest = max((v for name, v in numbers.items() if clock.column in (name, leaf(name))), key=len)
     seconds = float(longest[-1] - longest[0]) * find_unit(clock.unit).factor
     weights = {
@@ -75,7 +75,7 @@ def open_table(path: Path, table: Columns, rate: float | None = None) -> Opened:
         for name, values in numbers.items()
         if len(values) and (values == values[0]).all() and read_name(leaf(name)).unit == "kg"
     }
-    return Opened(clock, episodes, _together(numbers, clock, episodes), seconds, weights, (), lost)
+    return Opened(clock, episodes, _put_together(numbers, clock, episodes), seconds, weights, (), lost)
 
 
 def richest(
@@ -113,7 +113,7 @@ def leaf(name: str) -> str:
     return re.split(r"[./](?![^\[]*\])", name)[-1] or name
 
 
-def _episodes(numbers: Mapping[str, FloatArray]) -> str | None:
+def _find_episodes(numbers: Mapping[str, FloatArray]) -> str | None:
     """The column that numbers episodes: whole numbers that stay for long, and are more than one."""
     for name, values in numbers.items():
         whole = read_name(leaf(name)).kind == Kind.EPISODE and bool((values == np.round(values)).all())
@@ -122,13 +122,13 @@ def _episodes(numbers: Mapping[str, FloatArray]) -> str | None:
     return None
 
 
-def _clock(path: Path, numbers: Mapping[str, FloatArray]) -> Clock:
+def _find_clock(path: Path, numbers: Mapping[str, FloatArray]) -> Clock:
     """The clock that most columns have, of those the one with the best name."""
     times = {name: values for name, values in numbers.items() if read_name(leaf(name)).kind == Kind.TIME}
-    ranks = {name: _rank(leaf(name), values) for name, values in times.items() if _increases(values)}
+    ranks = {name: _rank_name(leaf(name), values) for name, values in times.items() if _increases(values)}
     if ranks:
         word = leaf(max(ranks, key=ranks.__getitem__))
-        return _timed(word, max((values for name, values in numbers.items() if leaf(name) == word), key=len))
+        return _make_clock(word, max((values for name, values in numbers.items() if leaf(name) == word), key=len))
     for name, values in times.items():
         steps = np.diff(values) if len(values) > 2 else np.zeros(0)
         repeats = np.flatnonzero(steps == 0)
@@ -140,19 +140,19 @@ def _clock(path: Path, numbers: Mapping[str, FloatArray]) -> Clock:
     for name, values in numbers.items():
         steps = np.diff(values)
         if _increases(values) and np.mean(np.abs(steps - np.median(steps)) > 0.5 * np.median(steps)) < 0.3:
-            return _timed(leaf(name), values, f"the only kind of column that rises steadily: {name}")
+            return _make_clock(leaf(name), values, f"the only kind of column that rises steadily: {name}")
     has = listed(list(map(repr, numbers)))
     raise LogError(f"{path}: no column is a clock that increases; it has {has}; give the rows' Hz: --rate 500")
 
 
-def _rank(word: str, values: FloatArray) -> float:
+def _rank_name(word: str, values: FloatArray) -> float:
     """How good a name of a clock is; one that counts samples is none."""
     label, counts = read_name(word), float(np.median(np.diff(values))) == 1.0 and word not in ("time", "t")
     rank = 3.0 * (word == "time") + 2.0 * (word in ("t", "timestamp")) + bool(label.unit) - 0.1 * len(label.words)
     return rank + 0.001 * float(np.log(len(values))) - 4.0 * (counts and not label.unit)
 
 
-def _timed(word: str, values: FloatArray, why: str = "") -> Clock:
+def _make_clock(word: str, values: FloatArray, why: str = "") -> Clock:
     """A clock with its unit, by its name or by its step; why: what else is to be doubted."""
     period, named = float(np.median(np.diff(values))), read_name(word).unit
     sized, named = time_unit(period), named if named in ("s", "ms", "us", "ns") else ""
@@ -168,7 +168,7 @@ def _increases(values: FloatArray) -> bool:
     return len(values) > 2 and bool(np.isfinite(values).all() and (np.diff(values) > 0).all())
 
 
-def _together(numbers: Mapping[str, FloatArray], clock: Clock, episodes: str | None) -> dict[str, FloatArray]:
+def _put_together(numbers: Mapping[str, FloatArray], clock: Clock, episodes: str | None) -> dict[str, FloatArray]:
     """The columns that change, on the clock with most samples: those of other clocks as they are held."""
     times = {name: clock_of(dict(numbers), name, clock.column) for name in numbers}
     usable = {

@@ -115,10 +115,10 @@ def plain(values: NDArray[np.generic]) -> NDArray[np.generic]:
     return np.divide(values, np.timedelta64(1, "s")) if values.dtype.kind == "m" else values
 
 
-def as_numbers(values: NDArray[np.generic]) -> tuple[FloatArray, int] | None:
+def read_numbers(values: NDArray[np.generic]) -> tuple[FloatArray, int] | None:
     """A column (n,) as numbers, NaN where a cell is text, and how many cells are; None for a column without numbers.
 
-    Text in more than a tenth of the cells is for the caller to refuse: ``too_many``.
+    Text in more than a tenth of the cells is for the caller to refuse: ``is_text``.
     """
     if values.dtype.kind not in "OSU":
         return (values.astype(np.float64), 0) if values.dtype.kind in "biuf" else None
@@ -128,7 +128,7 @@ def as_numbers(values: NDArray[np.generic]) -> tuple[FloatArray, int] | None:
     return None if lost and not np.isfinite(numbers).any() else (numbers, lost)
 
 
-def too_many(lost: int, cells: int) -> bool:
+def is_text(lost: int, cells: int) -> bool:
     """Whether so much of a column is text that these are no cells that a sensor has missed."""
     return 10 * lost > cells
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from sipe_bayes.calibration.column_names import pieces_of, vocabulary
+from sipe_bayes.calibration.column_names import pieces_of, read_vocabulary
 from sipe_bayes.calibration.init.draft import Unknown
 from sipe_bayes.calibration.init.unknowns.effects import Fit
 from sipe_bayes.core.arrays import FloatArray
@@ -67,7 +67,7 @@ def together(unknowns: Sequence[Unknown], fit: Fit, given: FloatArray, groups: S
 
 def _signature(model: mujoco.MjModel, kind: str, name: str) -> Part:
     """What is the same of parts that are alike."""
-    stem = tuple(piece for piece in pieces_of(name) if piece not in vocabulary().of("side"))
+    stem = tuple(piece for piece in pieces_of(name) if piece not in read_vocabulary().of("side"))
     if kind == "body":
         body = model.body(name)
         return (*stem, *body.mass.tolist(), *np.round(np.sort(body.inertia), 12).tolist())
@@ -90,7 +90,7 @@ def _of_actuator(model: mujoco.MjModel, index: int) -> Part:
 def _name(some: Sequence[Unknown], what: str, taken: set[str]) -> str:
     """What the parts' names have in common, else the sort of them."""
     names = [unknown.name.removesuffix(f"_{what}") for unknown in some]
-    stems = {tuple(piece for piece in pieces_of(name) if piece not in vocabulary().of("side")) for name in names}
+    stems = {tuple(piece for piece in pieces_of(name) if piece not in read_vocabulary().of("side")) for name in names}
     kind = some[0].targets[0].partition(":")[0]
     stem = "_".join(stems.pop()) if len(stems) == 1 else ""
     word = stem or {"body": "bodies"}.get(kind, f"{kind}s")
