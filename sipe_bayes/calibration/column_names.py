@@ -55,6 +55,7 @@ class Label:
     stem: str  # the name without that number; columns of one stem are a family
     unit: str = ""  # unit word; "" where it names none
     angular: bool | None = None  # whether it speaks of an angle; None where it says nothing
+    last: str = ""  # word before the unit
     axis: str = ""  # "x", "y", "z" or "w"
     vector: str = ""  # the name without that axis; columns of one are its components
     measured: bool = False  # whether it says so, as in tau_measured
@@ -155,8 +156,9 @@ def read_name(column: str, own: Collection[str] = ()) -> Label:
     flags, rest = _find_flags(words, unit)
     kind = kind or next((kind for kind, rule in read_vocabulary().rules if _holds(rule, flags)), Kind.UNKNOWN)
     unit = "" if "gauge" in flags and kind != Kind.OTHER else unit
-    axis = _find_axis(words)
-    if axis and kind in (Kind.POSITION, Kind.UNKNOWN) and _is_quaternion(words):
+    axis, vector = _find_axis(column, words)
+    turned = {"quat", "quaternion", "orientation", "rotation", f"q{axis}"}
+    if axis and kind in (Kind.POSITION, Kind.UNKNOWN) and turned.intersection(words):
         kind = Kind.QUATERNION
     turns = bool(flags & {"in_angle", "in_angular_velocity", "gyro"})
     slides = bool(flags & {"in_length", "in_velocity", "in_force"}) or ("length" in flags and not turns)
@@ -169,8 +171,9 @@ def read_name(column: str, own: Collection[str] = ()) -> Label:
         re.sub(r"\d+(?=\D*$)", "#", column) if numbers else column,
         unit,
         False if slides else True if turns or "angle" in flags else None,
+        words[-1] if words else "",
         axis,
-        _drop_axis(column, words[-1]) if axis else "",
+        vector,
         measured or "measured" in flags,
         "driven" in flags,
     )
@@ -263,20 +266,13 @@ def _find_derived(word: str) -> str:
     return next((one for one in inner if one != word and known.get(one, set()) & _WHERE), "")
 
 
-def _find_axis(words: list[str]) -> str:
-    """The axis of a vector's or quaternion's component: pos_x, qw, px."""
+def _find_axis(column: str, words: list[str]) -> tuple[str, str]:
+    """The axis of a component of a vector or quaternion, as in pos_x, qw, px, and the name without it."""
     last = words[-1] if words else ""
-    return last[-1] if re.fullmatch("[qprvwga]?[xyzw]", last) else ""
-
-
-def _drop_axis(column: str, last: str) -> str:
-    """The name without the axis that its last word ends with, whatever unit comes after it."""
-    piece = [piece for piece in _PIECE.finditer(column) if piece[0].lower() == last][-1]
-    return column[: piece.end() - 1] + column[piece.end() :]
-
-
-def _is_quaternion(words: list[str]) -> bool:
-    return words[-1][0] == "q" or bool({"quat", "quaternion", "orientation", "rotation"} & {*words})
+    if not re.fullmatch("[qprvwga]?[xyzw]", last):
+        return "", ""
+    end = [piece.end() for piece in _PIECE.finditer(column) if piece[0].lower() == last][-1]
+    return last[-1], column[: end - 1] + column[end:]
 
 
 def alike(words: Collection[str], *names: str) -> float:

@@ -38,13 +38,7 @@ def with_forces(
 ) -> tuple[Draft, list[str]]:
     """The draft with columns that go as the forces of drives do, and what is to be said of those that do not.
 
-    Args:
-        draft: whose commands and positions are decided.
-        matches: columns with ``joint:NAME.force``.
-        model: as given.
-        machine: what of it logs hold.
-        sources: logs.
-        folder: of the configuration.
+    Commands and positions of the draft are decided; matches are columns with ``joint:NAME.force``.
     """
     hinges = {f"joint:{joint.name}.force" for joint in machine.joints if joint.hinge}
     words = [unit_words("torque" if match.target in hinges else "force") for match in matches]

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.optimize
 
-from sipe_bayes.calibration.column_names import Kind, Label, alike, pieces_of, read_name, read_vocabulary, spell_unit
+from sipe_bayes.calibration.column_names import Kind, Label, alike, pieces_of, read_name, read_vocabulary
 from sipe_bayes.calibration.machine import Drive, Machine
 from sipe_bayes.calibration.signals import slope_of
 from sipe_bayes.core.arrays import FloatArray
@@ -401,9 +401,9 @@ def _match_vectors(machine: Machine, labels: list[Label]) -> tuple[list[Match], 
 def _find_vectors(machine: Machine, label: Label, stem: str) -> set[str]:
     """The vectors of which a column may be a component, by its name and that without its axis."""
     if label.kind == Kind.ACCELERATION:
-        return {"accelerometer"} if _has_any(stem, "acc", "linear") or _ends_with(stem, "a") else set()
+        return {"accelerometer"} if _has_any(stem, "acc", "linear") or label.last.rstrip("xyz") == "a" else set()
     if label.kind == Kind.VELOCITY:
-        gyro = {"gyro"} if _has_any(stem, "gyro", "omega", "ang") or _ends_with(stem, "g") else set()
+        gyro = {"gyro"} if _has_any(stem, "gyro", "omega", "ang") or label.last.rstrip("xyz") == "g" else set()
         return {"angular_velocity" if _is_spin(label, stem) else "linear_velocity", *gyro}
     spelt = _has_any(stem, "quat", "orientation") or (not machine.joints and pieces_of(stem)[-1:] == ["q"])
     if label.kind == Kind.QUATERNION or (spelt and label.number is not None):
@@ -415,32 +415,27 @@ def _has_any(stem: str, *words: str) -> bool:
     return any(word in stem.lower() for word in words)
 
 
-def _ends_with(stem: str, letter: str) -> bool:
-    """Whether a component's name, without its axis and unit, ends with a letter."""
-    pieces = pieces_of(stem)
-    while len(pieces) > 1 and pieces[-1] != letter and (pieces[-1] in ("per", "2") or spell_unit(pieces[-1:])):
-        pieces.pop()
-    return pieces[-1:] == [letter]
-
-
 def _is_spin(label: Label, stem: str) -> bool:
     """Whether a velocity is an angular one."""
     if label.unit or _has_any(stem, "ang", "omega", "gyro"):
         return not label.unit or label.unit.startswith(("rad", "deg", "rev", "rpm"))
-    if read_vocabulary().of("about").intersection(pieces_of(label.column)):
+    if label.last in read_vocabulary().of("about"):
         return not _has_any(stem, "lin")
     return bool({"w", "g"} & {*pieces_of(stem)}) and not _has_any(stem, "vel", "lin")  # beside these `w` is the frame
 
 
 def _doubt_velocity(label: Label, target: str) -> str:
     """Why the velocity of a body that a component's name was taken for may be another one; "" where it is clear."""
-    pieces = {*pieces_of(label.column)}
     if not target.startswith("body:") or label.kind != Kind.VELOCITY or _has_any(label.vector, "ang", "omega"):
         return ""
-    if {"gx", "gy", "gz"} & pieces:
+    if label.last in ("gx", "gy", "gz"):
         return "a gyro tells it in the body's own axes: if it is one, give the model a <gyro>"
-    glued, linear = read_vocabulary().of("about") & pieces, _has_any(label.vector, "lin")
-    if label.unit or not (linear or _has_any(label.vector, "vel")) or not (glued or ("w" in pieces and not linear)):
+    glued, linear = label.last in read_vocabulary().of("about"), _has_any(label.vector, "lin")
+    if (
+        label.unit
+        or not (linear or _has_any(label.vector, "vel"))
+        or not (glued or ("w" in pieces_of(label.column) and not linear))
+    ):
         return ""
     other = "linear" if target.endswith("angular_velocity") else "angular"
     return f"or are they its {other} velocity, since `w` is the world as well as a rate?"
