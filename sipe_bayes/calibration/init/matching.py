@@ -430,12 +430,9 @@ def _doubt_velocity(label: Label, target: str) -> str:
         return ""
     if label.last in ("gx", "gy", "gz"):
         return "a gyro tells it in the body's own axes: if it is one, give the model a <gyro>"
-    glued, linear = label.last in read_vocabulary().of("about"), _has_any(label.vector, "lin")
-    if (
-        label.unit
-        or not (linear or _has_any(label.vector, "vel"))
-        or not (glued or ("w" in pieces_of(label.column) and not linear))
-    ):
+    linear = _has_any(label.vector, "lin")
+    either = label.last in read_vocabulary().of("about") or ("w" in pieces_of(label.column) and not linear)
+    if label.unit or not either or not (linear or _has_any(label.vector, "vel")):
         return ""
     other = "linear" if target.endswith("angular_velocity") else "angular"
     return f"or are they its {other} velocity, since `w` is the world as well as a rate?"
