@@ -135,8 +135,9 @@ def is_text(lost: int, cells: int) -> bool:
 
 def _number_in(cell: object) -> float | None:
     """NaN for a blank cell, None for one that is no number."""
+    if cell is None or str(cell).strip() == "":
+        return np.nan
     try:
-        blank = cell is None or str(cell).strip() == ""
-        return np.nan if blank else None if isinstance(cell, complex | np.complexfloating) else float(cell)  # type: ignore[arg-type]
+        return None if isinstance(cell, complex | np.complexfloating) else float(cell)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         return None
