@@ -13,9 +13,9 @@ that the log measures, with a prior as wide as that measurement is uncertain. **
    left after a step. The end is the plain fit, the first answer. Of steps that gain about the same the shortest is
    taken: what a log leaves open stays near the model as given.
 2. FIT: theta and the initial states, noise by restricted likelihood before each step; on the same part, then on
-   ``whole`` times as many segments. Columns of the initial states are kept while they predict what a step gains. Where
-   one after the tenth step gains less than three quarters of what it promised, further ones by the same linearisation
-   lead back into a curved valley. The first step holds plain against generalised least squares
+   ``whole`` times as many segments. Columns of the initial states are kept while they predict what a step gains. Each
+   segment has a trust region of its own for its initial state: where a joint sticks or slips, one segment jumps, and
+   damping all of them for its sake would stop the fit. The first step holds plain against generalised least squares
    (``_noise_takes_over``), unless initial states explain nearly all that plain ones leave.
 3. COMPARE: the plain fit and the posterior mode each run free along the whole training logs. Where the mode is worse by
    more than 3 %, coloured noise explains what parameters should.

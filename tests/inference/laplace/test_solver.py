@@ -13,9 +13,11 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.laplace.options import LaplaceTuning, SolverTuning
-from sipe_bayes.inference.laplace.solver import SegmentSolver, SolverState, is_back, spread_segments
+from sipe_bayes.inference.laplace.solver import SegmentSolver, SolverState, is_back, spread_segments, stepped_starts
 from sipe_bayes.likelihood import Segments, StateSpace, bind
+from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.state_space.chain import Chain
+from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.prompt import PromptSimulator, prompt
 from sipe_bayes.simulation.simulator import Simulator
 
@@ -294,3 +296,19 @@ def test_plain_fits_have_no_last_word_where_initial_states_explain_the_misfit(mo
         print(explained, off, [item.code for item in method.findings], method.rollouts)
     assert off[0] < 4
     assert off[1] > 10
+
+
+def test_each_segment_takes_as_much_of_its_step_as_fits_it_best() -> None:
+    """Of changes that all segments need, one of which is thrice what its segment needs and another one wrong."""
+    log = recorded(3)
+    windows = bind(Segments(1.0, noise="white"), servo(), Trajectories.stack([log]))
+    assert isinstance(windows, Windows)
+    theta, noise = np.full(windows.num_theta, 0.5), Noise(np.full(1, 0.01), np.zeros(1))
+    best = windows.fit_starts(theta, noise)[0]
+    change = best - windows.no_starts()
+    change[1], change[2] = 3.3 * change[1], -change[2]
+    starts, residual, valid, shares = stepped_starts(windows, noise, theta[None], windows.no_starts(), change[None])
+    assert valid.all()
+    assert shares[0, :3].tolist() == [1.0, 0.3, 0.0]
+    assert starts[0, 0] == pytest.approx(best[0])
+    assert residual == pytest.approx(windows.residuals(theta[None], starts)[0])
