@@ -30,9 +30,8 @@ def init(
         if out.exists() and not force:
             raise ValueError(f"--out {out}: exists already; give --force to overwrite it, or another name")
         from sipe_bayes.calibration.init.asking import asked
-        from sipe_bayes.calibration.init.plotting import plot_columns
         from sipe_bayes.calibration.init.propose import propose
-        from sipe_bayes.calibration.init.write import summary, toml_of
+        from sipe_bayes.calibration.init.write import plot_columns, summary, toml_of
         from sipe_bayes.core.files import write_text
         from sipe_bayes.envs.foreign.named import model_file
 

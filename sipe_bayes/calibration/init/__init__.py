@@ -1,1 +1,1 @@
-"""A first configuration from a model and its logs: names, units, signs, delays and unknowns, with evidence."""
+"""A first configuration from a model and its logs: names, units, signs, delays and parameters, with evidence."""

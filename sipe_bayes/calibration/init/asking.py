@@ -29,14 +29,14 @@ def choices_of(draft: Draft) -> list[Choice]:
         others = _alternatives(reading.instead)
         if others and reading.doubts:
             columns = ", ".join(map(repr, reading.match.columns))
-            answers = (f"as proposed: {_now(reading)}", *("; ".join(lines) for lines in others))
+            factor = f", factor {reading.factor:g}" if reading.factor != 1 else ""
+            now = f"as proposed: unit {reading.unit}, sign {reading.sign}{factor}"
             changes = (_settled(k, ()), *(_settled(k, lines) for lines in others))
+            answers = (now, *("; ".join(lines) for lines in others))
             out.append(Choice(f"{columns}: {'; '.join(reading.doubts)}", answers, changes))
-    for turned_columns in draft.together:
-        group = [k for k, reading in enumerate(draft.readings) if reading.match.column in turned_columns]
-        names = " and ".join(map(repr, turned_columns))
-        text = f"{names}: sign ambiguity: flipped together they fit equally well"
-        out.append(Choice(text, ("as proposed", "flipped"), (lambda d: d, _turned(group))))
+    for group in draft.together:
+        text = f"{' and '.join(map(repr, group))}: sign ambiguity: flipped together they fit equally well"
+        out.append(Choice(text, ("as proposed", "flipped"), (lambda d: d, _flipped(group))))
     return out
 
 
@@ -47,16 +47,12 @@ def asked(draft: Draft, ask: Ask) -> Draft:
     return draft
 
 
-def _now(reading: Reading) -> str:
-    return f"unit {reading.unit}, sign {reading.sign}" + (f", factor {reading.factor:g}" if reading.factor != 1 else "")
-
-
 def _alternatives(lines: Sequence[str]) -> list[tuple[str, ...]]:
     """Lines of TOML by alternative: each begins where a key comes again."""
     out: list[list[str]] = []
     for line in lines:
         key = line.partition(" =")[0]
-        if not out or key in [own.partition(" =")[0] for own in out[-1]] or key in ("unit", "sign", "column"):
+        if not out or key in ("unit", "sign", "column") or any(key == own.partition(" =")[0] for own in out[-1]):
             out.append([])
         out[-1].append(line)
     return [tuple(own) for own in out]
@@ -66,37 +62,38 @@ def _settled(k: int, lines: Sequence[str]) -> Callable[[Draft], Draft]:
     """Reading number ``k`` with these lines in its table, and nothing open."""
 
     def change(draft: Draft) -> Draft:
-        keys, own = tomllib.loads("\n".join(lines)), draft.readings[k]
-        if "unit" in keys:
-            keys = {"factor": 1.0} | ({"zero": 0.0} if own.ends or own.scale.zero else {}) | keys
-        sign = keys.pop("sign", own.sign)
-        changed = {k: replace(own, doubts=(), instead=(), **_fields(own, dict(keys))).turned_to(sign)}
+        keys, own, readings = tomllib.loads("\n".join(lines)), draft.readings[k], list(draft.readings)
+        readings[k] = replace(_with_keys(own, keys), doubts=(), instead=())
         for place, other in enumerate(draft.readings):  # a set-point is read as the position that follows it
-            if (own.match.column, other.match.column) in draft.tied and "unit" in keys:
-                alike = (own.unit, own.factor) == (other.unit, other.factor)
-                changed |= {place: replace(other, **_fields(other, dict(keys)))} if alike else {}
-        return _put(draft, changed)
+            tied = (own.match.column, other.match.column) in draft.tied and "unit" in keys
+            if tied and (own.unit, own.factor) == (other.unit, other.factor):
+                readings[place] = _with_keys(other, {key: value for key, value in keys.items() if key != "sign"})
+        return draft.with_readings(readings)
 
     return change
 
 
-def _fields(reading: Reading, keys: dict[str, Any]) -> dict[str, Any]:
-    """Fields of a reading by keys of its table."""
-    column = keys.pop("column", None)
-    match = reading.match if column is None else replace(reading.match, columns=(str(column),))
-    quaternion = keys.pop("quaternion", None)
-    match = match if quaternion is None else replace(match, quaternion=str(quaternion))
-    return {"match": match, "ends": None if "unit" in keys else reading.ends} | keys
+def _with_keys(reading: Reading, keys: dict[str, Any]) -> Reading:
+    """A reading with other values of keys of its table."""
+    match = replace(
+        reading.match,
+        columns=(str(keys["column"]),) if "column" in keys else reading.match.columns,
+        quaternion=str(keys.get("quaternion", reading.match.quaternion)),
+    )
+    if "unit" in keys:
+        zero = 0.0 if reading.ends or reading.scale.zero else reading.zero
+        reading = replace(reading, ends=None, factor=1.0, zero=zero)
+    numbers = {key: keys[key] for key in ("unit", "factor", "zero") if key in keys}
+    return replace(reading, match=match, **numbers).turned_to(keys.get("sign", reading.sign))
 
 
-def _turned(group: Sequence[int]) -> Callable[[Draft], Draft]:
+def _flipped(columns: Sequence[str]) -> Callable[[Draft], Draft]:
+    """Columns with the other sign, and all else that is measured of their joints."""
+
     def change(draft: Draft) -> Draft:
-        joints = {draft.readings[k].match.target.rpartition(".")[0] for k in group} - {""}
-        felt = [k for k, r in enumerate(draft.readings) if r.match.target.rpartition(".")[0] in joints]
-        return _put(draft, {k: draft.readings[k].turned_to(turned(draft.readings[k].sign)) for k in {*group, *felt}})
+        joints = {r.match.target.rpartition(".")[0] for r in draft.readings if r.match.column in columns} - {""}
+        turn = [r.match.column in columns or r.match.target.rpartition(".")[0] in joints for r in draft.readings]
+        pairs = zip(draft.readings, turn, strict=True)
+        return draft.with_readings([r.turned_to(turned(r.sign)) if own else r for r, own in pairs])
 
     return change
-
-
-def _put(draft: Draft, changed: dict[int, Reading]) -> Draft:
-    return draft.with_readings([changed.get(k, reading) for k, reading in enumerate(draft.readings)])

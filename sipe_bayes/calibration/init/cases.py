@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from pathlib import Path
 
 import mujoco
@@ -12,12 +13,11 @@ from pydantic import ValidationError
 from sipe_bayes.calibration.config_fields import ConfigError, one_line
 from sipe_bayes.calibration.config_tables import LogEntry
 from sipe_bayes.calibration.init.decisions import GYRO_WORDS, Case
-from sipe_bayes.calibration.init.draft import Draft, Reading, Unknown, unit_words
+from sipe_bayes.calibration.init.draft import Draft, Proposal, Reading, is_tried, unit_words
+from sipe_bayes.calibration.init.parameters import as_parameters, candidates
 from sipe_bayes.calibration.init.regression import Gyro, Regression
-from sipe_bayes.calibration.init.unknowns.candidates import as_parameters, candidates
 from sipe_bayes.calibration.logs import load_logs
 from sipe_bayes.calibration.machine import Machine, Sizes
-from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.smoothing import filled
 from sipe_bayes.core.telling import Tell, silent
 from sipe_bayes.core.trajectory import Trajectory
@@ -25,9 +25,8 @@ from sipe_bayes.core.units import find_unit
 from sipe_bayes.envs.channels import Channel
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 
-_SAMPLES = 20_000  # of a log that are looked at
-_DELAYS = (0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16)
-_LATEST = 0.2  # s, of a delay
+DELAYS = (0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16)
+"""Samples that are tried, up to 0.2 s."""
 
 
 @dataclass(frozen=True)
@@ -41,38 +40,27 @@ class Source:
 
 def tried_part(draft: Draft) -> Draft:
     """The draft with those measurements alone that tell where joints and bodies are."""
-    places = {r.match.target for r in draft.measurements}
-
-    def is_tried(target: str) -> bool:
-        if target.startswith("sensor:") or target.endswith(("linear_velocity", "angular_velocity", ".force")):
-            return False
-        return not target.endswith(".velocity") or target.removesuffix("velocity") + "position" not in places
-
-    return replace(draft, measurements=tuple(r for r in draft.measurements if is_tried(r.match.target)))
+    tried = tuple(r for r in draft.measurements if r.match.quaternion or is_tried(draft, r))
+    return replace(draft, measurements=tried)
 
 
-def rough_unknowns(model: mujoco.MjModel, machine: Machine, readings: Sequence[Reading]) -> list[Unknown]:
-    """Unknowns with bounds that the model alone tells."""
-    return candidates(model, machine, readings, Sizes.of(model, machine, None, None))
+def rough_parameters(model: mujoco.MjModel, machine: Machine, readings: Sequence[Reading]) -> tuple[Proposal, ...]:
+    """Parameters with bounds that the model alone tells."""
+    return tuple(candidates(model, machine, readings, Sizes.of(model, machine, None, None)))
 
 
 def loaded(draft: Draft, sources: Sequence[Source], folder: Path) -> list[Trajectory]:
-    """The logs as the draft reads them."""
+    """The logs as the draft reads them, up to 20,000 samples of each."""
     try:
         config = draft.config(folder)
     except ValidationError as error:
         raise ConfigError(f"calibrate.toml: {one_line(error.errors()[0])}") from None
+    episodes = [None if source.episode is None else (source.episode,) for source in sources]
     entries = [
-        LogEntry(
-            file=s.file,
-            name=f"{s.file.stem}-{k}",
-            episodes=None if s.episode is None else (s.episode,),
-            span=s.span,
-        )
-        for k, s in enumerate(sources)
+        LogEntry(file=source.file, name=f"{source.file.stem}-{k}", span=source.span, episodes=own)
+        for k, (source, own) in enumerate(zip(sources, episodes, strict=True))
     ]
-    read = [trajectory for trajectory, _ in load_logs(config, entries)]
-    return [log.slice(0, min(len(log), _SAMPLES)) for log in read]
+    return [log.slice(0, min(len(log), 20_000)) for log, _ in load_logs(config, entries)]
 
 
 def gyros_of(draft: Draft, model: mujoco.MjModel, machine: Machine) -> list[Reading]:
@@ -88,10 +76,11 @@ def _turning(model: mujoco.MjModel, sensor: str) -> set[str]:
     body, out = int(model.site_bodyid[model.sensor(sensor).objid[0]]), set[str]()
     while body:
         for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
-            kind, name = int(model.jnt_type[joint]), model.joint(joint).name
-            ball = kind in (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL))
-            if kind != int(mujoco.mjtJoint.mjJNT_SLIDE):
-                out.add(f"body:{model.body(body).name}.orientation" if ball else f"joint:{name}.position")
+            kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
+            if kind == mujoco.mjtJoint.mjJNT_HINGE:
+                out.add(f"joint:{model.joint(joint).name}.position")
+            elif kind != mujoco.mjtJoint.mjJNT_SLIDE:
+                out.add(f"body:{model.body(body).name}.orientation")
         body = int(model.body_parentid[body])
     return out
 
@@ -105,41 +94,33 @@ def case_of(
     gyros: Sequence[Reading] = (),
     tell: Tell = silent,
 ) -> Case:
-    """The regression of a draft's logs with its unknowns and gyros, and where its readings are in it."""
+    """The regression of a draft's logs with its parameters and gyros, and where its readings are in it."""
+    if not draft.parameters:
+        draft = replace(draft, parameters=rough_parameters(model, machine, draft.readings))
     whole = loaded(replace(draft, measurements=(*draft.measurements, *gyros)), sources, folder)
-    count = sum(len(m.channels) for m in draft.config(folder).measurements)
-    logs = [Trajectory(log.observations[:, :count], log.actions, log.dt, name=log.name) for log in whole]
     config = draft.config(folder)
+    ends = list(accumulate(len(m.channels) for m in config.measurements))
+    count = ends[-1]
+    logs = [Trajectory(log.observations[:, :count], log.actions, log.dt, name=log.name) for log in whole]
     channels = [Channel(*channel) for m in config.measurements for channel in m.channels]
     actuators = [c.actuator for c in config.commands]
-    unknowns = [u for u in draft.unknowns if not any(t.endswith(".delay") for t in u.targets)]
-    environment = MjcfEnvironment.build(str(config.model), as_parameters(model, unknowns), actuators, channels)
-    dt = logs[0].dt
-    delays = [d for d in _DELAYS if d * dt <= _LATEST and d < len(logs[0]) // 8] if actuators else [0]
+    written = as_parameters(model, [p for p in draft.parameters if not p.targets[0].endswith(".delay")])
+    environment = MjcfEnvironment.build(str(config.model), written, actuators, channels)
+    delays = [d for d in DELAYS if d * logs[0].dt <= 0.2 and d < len(logs[0]) // 8] if actuators else [0]
     regression = Regression(environment, logs, delays or [0])
-    places, at = [], 0
-    for m in config.measurements:
-        places.append(tuple(range(at, at + len(m.channels))))
-        at += len(m.channels)
-    regression.gyros = [
-        _gyro(model, regression, reading, [log.observations[:, count + 3 * k :][:, :3] for log in whole])
-        for k, reading in enumerate(gyros)
-    ]
+    pairs = list(zip(whole, regression.logs, strict=True))
+    for k, reading in enumerate(gyros):  # in any of its units where no name says one
+        site, own = int(model.sensor(reading.match.target.removeprefix("sensor:")).objid[0]), find_unit(reading.unit)
+        factors = tuple(find_unit(word).factor / own.factor for word in GYRO_WORDS)
+        factors = factors if reading.match.label.unit in ("", *GYRO_WORDS) else (1.0,)
+        cut = [log.observations[: len(own) + 1, count + 3 * k :][:, :3] for log, own in pairs]
+        regression.gyros.append(Gyro(site, tuple(filled(rates) for rates in cut), factors))
     regression.scales = [_scales_of(reading, machine) for reading in draft.commands]
     one_way = {f"actuator:{a.name}" for a in machine.actuators if a.one_way}
     regression.one_way[:] = [reading.match.target in one_way for reading in draft.commands]
-    empty: list[tuple[int, ...]] = [()] * len(actuators)
+    places = [tuple(range(a, b)) for a, b in zip([0, *ends], ends, strict=False)]
     commands = (*(None for _ in places), *range(len(actuators)))
-    return Case(draft, machine, regression, (*places, *empty), commands, tell=tell)
-
-
-def _gyro(model: mujoco.MjModel, regression: Regression, reading: Reading, rates: Sequence[FloatArray]) -> Gyro:
-    """A gyro's rates, in any of its units where no name says one."""
-    site = int(model.sensor(reading.match.target.removeprefix("sensor:")).objid[0])
-    named, own = reading.match.label.unit, find_unit(reading.unit).factor
-    factors = tuple(find_unit(word).factor / own for word in GYRO_WORDS)
-    some = [filled(x[: len(log) + 1]) for x, log in zip(rates, regression.logs, strict=True)]
-    return Gyro(site, tuple(some), (1.0,) if named not in ("", *GYRO_WORDS) else factors)
+    return Case(draft, machine, regression, (*places, *[()] * len(actuators)), commands, tell=tell)
 
 
 def _scales_of(reading: Reading, machine: Machine) -> tuple[float, ...]:

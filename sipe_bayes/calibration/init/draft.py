@@ -1,4 +1,4 @@
-"""What is proposed, as data: how columns are read, with evidence and doubts, logs, unknowns; and its configuration.
+"""What is proposed, as data: how columns are read, with evidence and doubts, logs, parameters; and its configuration.
 
 What names leave open of units and signs is a list of questions with their answers.
 """
@@ -17,11 +17,10 @@ from sipe_bayes.calibration.config import Config
 from sipe_bayes.calibration.config_fields import Use
 from sipe_bayes.calibration.init.matching import Match
 from sipe_bayes.calibration.init.tables import Clock
-from sipe_bayes.calibration.machine import Drive, Machine
+from sipe_bayes.calibration.machine import Actuator, Drive, Machine
 
 Row = dict[str, object]
 _IN_TURNS = {"estimate", "input", "odrive", "turns"}  # words of columns that drives log in turns
-_WIDE = 1.5  # sd of the logarithm of what a regression says of a gain
 
 
 class Scale(NamedTuple):
@@ -83,6 +82,17 @@ class Reading:
     instead: tuple[str, ...] = ()
 
     @property
+    def joint(self) -> str:
+        """The name of its joint; none where it is of something else."""
+        kind, _, name = self.match.target.rpartition(".")[0].partition(":")
+        return name if kind == "joint" else ""
+
+    def add_evidence(self, note: str = "", doubt: str = "", *instead: str) -> Reading:
+        """With what speaks for it or is open, where there is any, and lines of TOML that may stand there instead."""
+        notes, doubts = (*self.notes, *[note] * bool(note)), (*self.doubts, *[doubt] * bool(doubt))
+        return replace(self, notes=notes, doubts=doubts, instead=(*self.instead, *instead))
+
+    @property
     def commanded(self) -> bool:
         """Whether it drives an actuator."""
         return self.match.target.startswith("actuator:")
@@ -129,26 +139,20 @@ class Reading:
     def row(self) -> Row:
         """Its table in the configuration."""
         match = self.match
-        row: Row = {}
-        if self.commanded:
-            row["actuator"] = match.target.removeprefix("actuator:")
-        else:
-            row["target"] = match.target
+        name = match.target.removeprefix("actuator:")
+        row: Row = {"actuator": name} if self.commanded else {"target": name}
         row |= {"column": match.column} if len(match.columns) == 1 else {"columns": list(match.columns)}
         if match.quaternion:
             return row | {"quaternion": match.quaternion}
-        row["unit"] = self.unit
-        row |= {"sign": self.sign} if self.sign != 1 else {}
-        row |= {"factor": self.factor} if self.factor != 1 else {}
-        row |= {"zero": self.zero} if self.zero else {}
-        row |= {"wraps": True} if self.wraps else {}
-        row |= {"supply": {"column": self.supply[0], "unit": self.supply[1]}} if self.supply else {}
-        return row | ({} if self.fit else {"fit": False})
+        supply = None if self.supply is None else {"column": self.supply[0], "unit": self.supply[1]}
+        usual: Row = {"sign": 1, "factor": 1.0, "zero": 0.0, "wraps": False, "supply": None, "fit": True}
+        own: Row = {key: getattr(self, key) for key in usual} | {"supply": supply}
+        return row | {"unit": self.unit} | {key: value for key, value in own.items() if value != usual[key]}
 
 
 @dataclass(frozen=True)
-class Unknown:
-    """A parameter that is proposed.
+class Proposal:
+    """A parameter that may be free.
 
     left_out says why it stands in a comment only. expected, SI: what the logs say of a size that may be anything, which
     then has a log scale and a wide prior.
@@ -166,11 +170,10 @@ class Unknown:
     def row(self) -> Row:
         """Its table in the configuration."""
         target: Row = {"target": self.targets[0]} if len(self.targets) == 1 else {"targets": list(self.targets)}
-        row: Row = {"name": self.name}
-        row |= target | {"factor" if self.relative else "bounds": [self.low, self.high]}
+        row = {"name": self.name} | target | {"factor" if self.relative else "bounds": [self.low, self.high]}
         if self.expected is None:
             return row
-        wide = {"mean": self.expected, "sd": float(f"{_WIDE * self.expected:.3g}")}
+        wide = {"mean": self.expected, "sd": float(f"{1.5 * self.expected:.3g}")}  # sd of the logarithm: 1.5
         return row | {"scale": "log", "prior": wide}
 
 
@@ -186,11 +189,9 @@ class LogLine:
 
     def row(self) -> Row:
         """Its table in the configuration."""
-        row: Row = {"file": self.file}
-        row |= {"name": self.name} if self.name else {}
-        row |= {"use": self.use} if self.use != "train" else {}
-        row |= {"span": list(self.span)} if self.span else {}
-        return row | ({"episodes": list(self.episodes)} if self.episodes else {})
+        use, span = self.use if self.use != "train" else "", list(self.span or ())
+        row = {"file": self.file, "name": self.name, "use": use, "span": span, "episodes": list(self.episodes)}
+        return {key: value for key, value in row.items() if value}
 
 
 @dataclass(frozen=True)
@@ -204,14 +205,14 @@ class Draft:
         commands: columns that drive actuators.
         measurements: columns that measure.
         logs: that train, and that are held out.
-        window: s, or "log"; None for unknown states in place of windows.
+        window: s, or "log"; None for states that are free in place of windows.
         window_note: why.
-        unknowns: parameters, those that are left out among them.
+        parameters: those that are left out among them.
         doubts: what could not be decided, beside what readings say.
         notes: of the whole.
         unused: columns that are none of the model's.
         delay: of the commands, in samples.
-        seconds: that a calibration may take; 0 where nothing says it.
+        seconds: that a calibration may take.
         tied: columns of positions, each with that of the set-point that it follows.
         together: columns that may be flipped together, in groups.
         names: of columns without a header.
@@ -225,7 +226,7 @@ class Draft:
     logs: tuple[LogLine, ...]
     window: float | str | None
     window_note: str = ""
-    unknowns: tuple[Unknown, ...] = ()
+    parameters: tuple[Proposal, ...] = ()
     doubts: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
@@ -246,9 +247,9 @@ class Draft:
         return replace(self, measurements=tuple(readings[:measured]), commands=tuple(readings[measured:]))
 
     @property
-    def proposed(self) -> tuple[Unknown, ...]:
-        """The unknowns that are asked for."""
-        return tuple(unknown for unknown in self.unknowns if not unknown.left_out)
+    def free(self) -> tuple[Proposal, ...]:
+        """The parameters that are free."""
+        return tuple(one for one in self.parameters if not one.left_out)
 
     @property
     def likelihood(self) -> Row:
@@ -263,17 +264,15 @@ class Draft:
 
     def config(self, folder: Path) -> Config:
         """The configuration that it stands for; paths are relative to the folder."""
-        columns: Row = {"time": self.clock.row}
-        columns |= {"episode": self.episode} if self.episode else {}
-        columns |= {"names": list(self.names)} if self.names else {}
+        columns: Row = {"time": self.clock.row, "episode": self.episode, "names": list(self.names)}
         data: Row = {
             "model": self.model,
             **self.likelihood,
-            "columns": columns,
+            "columns": {key: value for key, value in columns.items() if value},
             "commands": [reading.row() for reading in self.commands],
             "measurements": [reading.row() for reading in self.measurements],
             "logs": [log.row() for log in self.logs],
-            "parameters": [unknown.row() for unknown in self.proposed],
+            "parameters": [one.row() for one in self.free],
         }
         return Config.model_validate(data, context={"folder": folder})
 
@@ -299,30 +298,28 @@ class Question:
         return isinstance(self.answers[0], int)
 
 
+def actuator_of(machine: Machine, target: str) -> Actuator | None:
+    """The actuator of a reading's target."""
+    return next((actuator for actuator in machine.actuators if target == f"actuator:{actuator.name}"), None)
+
+
 def unit_words(reading: Reading, machine: Machine) -> tuple[str, ...]:
     """The units that a column without one in its name may have, the likeliest first."""
     target, kind = reading.match.target, reading.match.label.kind
-    turns = bool(_IN_TURNS & {*pieces_of(reading.match.column)})
-    if target.startswith("body:"):
-        return ("m", "mm", "cm") if target.endswith(".position") else (reading.unit,)
-    if target.startswith("sensor:"):
+    joint = next((j for j in machine.joints if target.startswith(f"joint:{j.name}.")), None)
+    actuator = actuator_of(machine, target)
+    hinge = joint.hinge if joint is not None else actuator is not None and actuator.turns
+    drive = None if actuator is None else actuator.drive
+    in_turns = bool(_IN_TURNS & {*pieces_of(reading.match.column)})
+    if ((joint or target.startswith("body:")) and target.endswith(".position")) or drive == Drive.POSITION:
+        return ("rad", "deg", *["rev"] * in_turns) if hinge else ("m", "mm", "cm")
+    if joint is not None or drive == Drive.VELOCITY:
+        return ("rad/s", "deg/s", "rpm", *["rev/s"] * in_turns) if hinge else ("m/s", "mm/s")
+    if actuator is None or kind == Kind.DUTY:
         return (reading.unit,)
-    if target.startswith("joint:"):
-        joint = next(j for j in machine.joints if target.startswith(f"joint:{j.name}."))
-        if target.endswith(".position"):
-            return ("rad", "deg", *["rev"] * turns) if joint.hinge else ("m", "mm", "cm")
-        return ("rad/s", "deg/s", "rpm", *["rev/s"] * turns) if joint.hinge else ("m/s", "mm/s")
-    actuator = next(a for a in machine.actuators if target == f"actuator:{a.name}")
-    hinge = actuator.turns
-    if actuator.drive == Drive.POSITION:
-        return ("rad", "deg", *["rev"] * turns) if hinge else ("m", "mm", "cm")
-    if actuator.drive == Drive.VELOCITY:
-        return ("rad/s", "deg/s", "rpm", *["rev/s"] * turns) if hinge else ("m/s", "mm/s")
     if kind == Kind.CURRENT:
         return ("A", "mA")
-    if kind == Kind.DUTY:
-        return (reading.unit,)
-    if kind == Kind.VOLTAGE or (actuator.drive == Drive.VOLTAGE and kind != Kind.TORQUE):
+    if kind == Kind.VOLTAGE or (drive == Drive.VOLTAGE and kind != Kind.TORQUE):
         return ("V", "mV")
     if kind == Kind.TORQUE or reading.unit != "1":
         return ("N m", "mN m") if hinge else ("N", "mN")
@@ -370,7 +367,9 @@ def turned(sign: Answer) -> int:
     return -1 if sign == 1 else 1
 
 
-def answered(readings: Sequence[Reading], asked: Sequence[Question], answers: Sequence[Answer]) -> tuple[Reading, ...]:
+def apply_answers(
+    readings: Sequence[Reading], asked: Sequence[Question], answers: Sequence[Answer]
+) -> tuple[Reading, ...]:
     """The readings with the answers to all questions."""
     out = list(readings)
     for question, answer in zip(asked, answers, strict=True):

@@ -13,15 +13,15 @@ from sipe_bayes.calibration.column_names import read_name
 from sipe_bayes.calibration.config import Config, load_config
 from sipe_bayes.calibration.config_tables import Command, Measurement
 from sipe_bayes.calibration.gathered import no_rigid_bodies
-from sipe_bayes.calibration.init.cases import Source, case_of, rough_unknowns, tried_part
-from sipe_bayes.calibration.init.decisions import DECIDED, Case, Search, decide, searched
+from sipe_bayes.calibration.init.cases import Source, case_of, rough_parameters, tried_part
+from sipe_bayes.calibration.init.decisions import DECIDED, Case, Search, decide, search_answers
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading
 from sipe_bayes.calibration.init.matching import Match
-from sipe_bayes.calibration.init.oddities import oddities
+from sipe_bayes.calibration.init.oddities import find_oddities
 from sipe_bayes.calibration.init.readings import with_velocities
 from sipe_bayes.calibration.init.regression import Regression
+from sipe_bayes.calibration.init.selection import delay_of
 from sipe_bayes.calibration.init.tables import Opened, open_table
-from sipe_bayes.calibration.init.unknowns.effects import delay_of
 from sipe_bayes.calibration.machine import Machine
 from sipe_bayes.calibration.problem import environment_of
 from sipe_bayes.calibration.readers.tables import read_table
@@ -69,15 +69,15 @@ def validate_config(path: Path) -> Validated:
     opened = open_table(train[0].file, read_table(train[0].file, (), config.columns.names), config.columns.time.rate)
     draft = _draft_of(config, opened, folder)
     part = tried_part(draft)
-    part = replace(part, unknowns=tuple(rough_unknowns(model, machine, draft.readings)))
+    part = replace(part, parameters=rough_parameters(model, machine, draft.readings))
     sources = [Source(log.file, log.episodes[0] if log.episodes else None, log.span) for log in train]
     case = case_of(part, model, machine, sources, folder)
-    search = searched(case)
+    search = search_answers(case)
     better = decide(search)
     out = [f"parameters: {one.text}. {ADVICE[one.code]}" for one in bodies]
     out += _other_readings(search, part, better)
     out = out or _swapped(case)
-    out += [one.text for one in oddities(case, opened)]
+    out += find_oddities(case, opened)
     if not out:
         out += _delays(config, case)
     out += _clipped(config, draft, machine, opened) + _slopes(draft, opened) + _turns(draft, opened)

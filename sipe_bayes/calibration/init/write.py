@@ -1,4 +1,4 @@
-"""The configuration as TOML with its evidence in comments, and what the terminal says of it."""
+"""The configuration as TOML with its evidence in comments, what the terminal says of it, and a picture."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
-from sipe_bayes.calibration.init.draft import Draft, Reading, Unknown
+import numpy as np
+
+from sipe_bayes.calibration.config import load_config
+from sipe_bayes.calibration.init.draft import Draft, Proposal, Reading
+from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.core.files import printed
 from sipe_bayes.core.toml import to_toml
-
-_WIDTH = 118
-_INLINE = 6  # logs from which they stand on one line each
+from sipe_bayes.core.units import find_unit
 
 
 def toml_of(draft: Draft, command: str) -> str:
@@ -20,29 +22,26 @@ def toml_of(draft: Draft, command: str) -> str:
     parts = [*map(_comment, notes), *map(_open, draft.doubts)]
     text = "\n".join(parts) + "\n\n" + to_toml({"model": draft.model, **draft.likelihood}).rstrip("\n")
     text += f" # {printed(draft.window_note)}\n"
-    if len(draft.logs) >= _INLINE:
+    inline = len(draft.logs) > 5  # which then stand on one line each
+    if inline:
         rows = [to_toml({"row": [log.row()]}) for log in draft.logs]
         lines = ["{" + ", ".join(row.splitlines()[1:]) + "}" for row in rows]
         text += "logs = [\n" + "".join(f"    {line},\n" for line in lines) + "]\n"
     clock = draft.clock
     text += "\n[columns]\n" + "".join(f"{_open(clock.doubt)}\n" for _ in range(bool(clock.doubt)))
     text += to_toml({"row": [{"time": clock.row}]}).splitlines()[1] + f" # {printed(clock.why)}\n"
-    text += f"episode = {_string(draft.episode)}\n" if draft.episode else ""
-    text += to_toml({"names": list(draft.names)}) if draft.names else ""
+    text += to_toml({"episode": draft.episode} if draft.episode else {})
+    text += to_toml({"names": list(draft.names)} if draft.names else {})
     blocks = [_reading("commands", reading) for reading in draft.commands]
     blocks += [_reading("measurements", reading) for reading in draft.measurements]
-    if len(draft.logs) < _INLINE:
+    if not inline:
         blocks += [to_toml({"logs": [log.row()]}) for log in draft.logs]
-    blocks += [_unknown(unknown) for unknown in draft.unknowns]
+    blocks += [_parameter(one) for one in draft.parameters]
     return text + "\n" + "\n".join(blocks)
 
 
-def _string(word: str) -> str:
-    return to_toml({"w": word}).split(" = ", 1)[1].rstrip("\n")
-
-
 def _comment(text: str) -> str:
-    return "\n".join(textwrap.wrap(printed(text), _WIDTH, initial_indent="# ", subsequent_indent="#   "))
+    return "\n".join(textwrap.wrap(printed(text), 118, initial_indent="# ", subsequent_indent="#   "))
 
 
 def _open(doubt: str) -> str:
@@ -66,40 +65,34 @@ def _of_range(reading: Reading) -> list[str]:
     return [f"a share of the joint's range: {first:g} at {low:g} {reading.unit}, {last:g} at {high:g} {reading.unit}"]
 
 
-def _unknown(unknown: Unknown) -> str:
-    body = to_toml({"parameters": [unknown.row() | {"description": unknown.note}]})
-    if not unknown.left_out:
+def _parameter(one: Proposal) -> str:
+    body = to_toml({"parameters": [one.row() | {"description": one.note}]})
+    if not one.left_out:
         return body
-    return _comment(f"left out: {unknown.left_out}") + "\n" + "".join(f"# {line}\n" for line in body.splitlines())
+    return _comment(f"left out: {one.left_out}") + "\n" + "".join(f"# {line}\n" for line in body.splitlines())
 
 
 def summary(draft: Draft, path: str, picture: Path | None = None) -> list[str]:
     """What was found, what is open, and what to do next."""
-    held, train = (
-        sum(max(1, len(log.episodes)) for log in draft.logs if log.use == use) for use in ("holdout", "train")
-    )
-    names = [unknown.name for unknown in draft.proposed]
+    held = sum(max(1, len(log.episodes)) for log in draft.logs if log.use == "holdout")
+    train = sum(max(1, len(log.episodes)) for log in draft.logs) - held
+    about = f"{draft.seconds:.0f} s" if draft.seconds < 100 else f"{draft.seconds / 60:.0f} min"
+    names = [one.name for one in draft.free]
     return [
         *_table([_said(reading) for reading in draft.readings]),
         *_unused(draft),
         f"time {draft.clock.column!r} in {draft.clock.unit}; {train} to train on, {held} held out",
         f"{len(names)} parameters: {', '.join(names)}",
-        *(u.note for u in draft.proposed if u.name == "delay"),
+        *(one.note for one in draft.free if one.name == "delay"),
         *(f"OPEN: {doubt}" for doubt in draft.open_doubts),
         *([] if picture is None else [f"columns: {picture}"]),
-        f"next: sipe calibrate {path}{_about(draft.seconds)}",
+        f"next: sipe calibrate {path} (about {about})",
     ]
 
 
 def _table(rows: Sequence[tuple[str, ...]]) -> list[str]:
     widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
     return ["  ".join(cell.ljust(n) for cell, n in zip(row, widths, strict=True)).rstrip() for row in rows]
-
-
-def _about(seconds: float) -> str:
-    if not seconds:
-        return ""
-    return f" (about {seconds:.0f} s)" if seconds < 100 else f" (about {seconds / 60:.0f} min)"
 
 
 def _unused(draft: Draft) -> list[str]:
@@ -115,3 +108,35 @@ def _said(reading: Reading) -> tuple[str, ...]:
     extra = [f"zero {reading.zero:.4g}"] * bool(reading.zero) + ["wraps"] * reading.wraps
     extra += ["not fitted"] * (not reading.fit)
     return reading.match.target, f"<- {', '.join(reading.match.columns)}", f"[{unit}]", ", ".join(extra)
+
+
+def plot_columns(draft: Draft, path: Path) -> Path:
+    """Draw each matched column of the first log over time, set-points over the positions that follow them.
+
+    Args:
+        draft: of the configuration.
+        path: of the configuration, which has been written.
+
+    Returns:
+        The PNG beside it.
+    """
+    from matplotlib.figure import Figure
+
+    config = load_config(path)
+    log, _ = load_log(config, config.logs[0])
+    time = log.dt * np.arange(len(log) + 1)
+    names = [*config.channels, *(f"command {reading.match.column}" for reading in draft.commands)]
+    values = np.concatenate([log.observations, np.concatenate([log.actions, log.actions[-1:]])], axis=1)
+    units = [find_unit(m.unit).si for m in config.measurements for _ in m.channels]
+    units += [find_unit(reading.unit).si for reading in draft.commands]
+    figure = Figure(figsize=(9.0, 1.3 * max(2, len(names))), layout="constrained")
+    for axes, name, unit, series in zip(
+        np.ravel(figure.subplots(len(names), sharex=True, squeeze=False)), names, units, values.T, strict=True
+    ):
+        axes.plot(time, series, linewidth=0.8)
+        axes.set_title(f"{name} [{unit}]", fontsize=8, loc="left")
+        axes.tick_params(labelsize=7)
+    axes.set_xlabel("time [s]", fontsize=8)
+    target = path.with_suffix(".png")
+    figure.savefig(target, dpi=110)
+    return target

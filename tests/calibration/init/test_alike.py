@@ -5,10 +5,8 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from sipe_bayes.calibration.init.draft import Unknown
-from sipe_bayes.calibration.init.unknowns.alike import shared, together
-from sipe_bayes.calibration.init.unknowns.choice import MOST, chosen
-from sipe_bayes.calibration.init.unknowns.effects import Fit
+from sipe_bayes.calibration.init.draft import Proposal
+from sipe_bayes.calibration.init.selection import MOST, Fit, alike_parts, choose, share_parameters
 
 LEGS = ("FL", "FR", "RL", "RR")
 
@@ -29,12 +27,12 @@ def model_of(legs: str, kp: dict[str, float]) -> mujoco.MjModel:
     )
 
 
-def unknown(name: str, target: str, high: float = 1.0, relative: bool = False) -> Unknown:
-    return Unknown(name, (target,), 0.0, high, relative, "0 in the model")
+def unknown(name: str, target: str, high: float = 1.0, relative: bool = False) -> Proposal:
+    return Proposal(name, (target,), 0.0, high, relative, "0 in the model")
 
 
-def names(model: mujoco.MjModel, unknowns: list[Unknown], what: str) -> list[set[str]]:
-    return [{unknowns[k].name for k in group} for group in shared(model, unknowns, what)]
+def names(model: mujoco.MjModel, unknowns: list[Proposal], what: str) -> list[set[str]]:
+    return [{unknowns[k].name for k in group} for group in alike_parts(model, unknowns, what)]
 
 
 def test_who_shares() -> None:
@@ -66,11 +64,11 @@ def test_what_one_parameter_does_is_what_all_of_them_do() -> None:
         unknown("FR_hip_damping", "joint:FR_hip.damping", 2.0),
     ]
     jacobian = np.random.default_rng(0).standard_normal((50, 3))  # and of what stands behind them
-    fit = Fit(np.array([0.4, 0.1, 0.9]), np.ones(3), jacobian)
-    (one,), after, own = together(unknowns, fit, np.array([0.2, 0.1, 0.0]), [[0, 1]], "damping")
+    fit = Fit(np.array([0.4, 0.1, 0.9]), np.array([0.2, 0.1, 0.0]), jacobian)
+    (one,), after = share_parameters(unknowns, fit, [[0, 1]], "damping")
     assert (one.name, one.low, one.high) == ("hip_damping", 0.0, 2.0)
     assert one.targets == ("joint:FL_hip.damping", "joint:FR_hip.damping")
-    np.testing.assert_allclose([after.theta[0], own[0]], [0.5 * (0.4 + 0.2) / 2.0, 0.5 * (0.2 + 0.2) / 2.0])
+    np.testing.assert_allclose([after.theta[0], after.nominal[0]], [0.5 * (0.4 + 0.2) / 2.0, 0.5 * (0.2 + 0.2) / 2.0])
     np.testing.assert_allclose(after.jacobian[:, 0], 2.0 * jacobian[:, 0] + jacobian[:, 1])
 
 
@@ -83,8 +81,8 @@ def test_only_as_many_share_as_is_needed() -> None:
         unknowns = [unknown(f"{j}_kp", f"actuator:{j}.kp", relative=True) for j in joints]
         unknowns += [unknown(f"{j}_{field}", f"joint:{j}.{field}") for j in joints for field in fields]
         n = len(unknowns)
-        fit = Fit(np.full(n, 0.5), np.ones(n), 100 * rng.standard_normal((400, n)))
-        left, values = chosen(model, unknowns, fit, np.zeros(n), False)
+        fit = Fit(np.full(n, 0.5), np.zeros(n), 100 * rng.standard_normal((400, n)))
+        left, values = choose(model, unknowns, fit, False)
         assert len(values) == len(left)
         return [u.name for u in left if not u.left_out]
 

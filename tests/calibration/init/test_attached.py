@@ -58,9 +58,9 @@ def test_a_share_is_one_of_the_ctrlrange(end: float | None, factor: float, tmp_p
 def test_what_is_attached_is_offered(tmp_path: Path) -> None:
     _arm_log(tmp_path, "torque")
     draft = propose(tmp_path / "arm.xml", [tmp_path / "log.csv"], tmp_path)
-    unknowns = {unknown.name: unknown for unknown in draft.unknowns}
+    unknowns = {unknown.name: unknown for unknown in draft.parameters}
     assert "attached to lower" in unknowns["tool_mass"].note
-    asked = {unknown.name for unknown in draft.proposed}
+    asked = {unknown.name for unknown in draft.free}
     print({name: unknown.left_out for name, unknown in unknowns.items()})
     assert {"upper_mass", "lower_mass"} <= asked
     assert not [doubt for doubt in draft.doubts if "no force is known" in doubt]
@@ -69,8 +69,8 @@ def test_what_is_attached_is_offered(tmp_path: Path) -> None:
 def test_without_a_known_force_the_masses_are_the_scale(tmp_path: Path) -> None:
     _arm_log(tmp_path, "duty")
     draft = propose(tmp_path / "arm.xml", [tmp_path / "log.csv"], tmp_path)
-    asked = {unknown.name for unknown in draft.proposed}
-    left = [u.name for u in draft.unknowns if u.name.endswith("_mass") and "no force is known" in u.left_out]
+    asked = {unknown.name for unknown in draft.free}
+    left = [u.name for u in draft.parameters if u.name.endswith("_mass") and "no force is known" in u.left_out]
     assert left == ["upper_mass", "lower_mass", "tool_mass"]
     assert {"shoulder_gain", "elbow_gain"} <= asked
     assert any("no force is known" in doubt and left[0] in doubt for doubt in draft.doubts)
@@ -88,5 +88,5 @@ def test_an_inertial_unit_alone(tmp_path: Path) -> None:
     pd.DataFrame(rows, columns=names).to_csv(tmp_path / "log.csv", index=False)
     draft = propose(tmp_path / "roller.xml", [tmp_path / "log.csv"], tmp_path)
     assert draft.config(tmp_path).likelihood == "state_space"
-    assert {"gyro_bias_x", "accelerometer_bias_z"} <= {unknown.name for unknown in draft.proposed}
+    assert {"gyro_bias_x", "accelerometer_bias_z"} <= {unknown.name for unknown in draft.free}
     assert any("nothing was simulated" in doubt for doubt in draft.doubts)

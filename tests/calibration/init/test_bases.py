@@ -6,7 +6,7 @@ import mujoco
 import pytest
 
 from sipe_bayes.calibration.column_names import read_name
-from sipe_bayes.calibration.init.cases import rough_unknowns
+from sipe_bayes.calibration.init.cases import rough_parameters
 from sipe_bayes.calibration.init.draft import Reading
 from sipe_bayes.calibration.init.matching import Match
 from sipe_bayes.calibration.machine import Machine, base_joints, bases
@@ -59,7 +59,7 @@ def test_what_is_asked_of_a_base() -> None:
     names = {f"joint:{joint}.position": f"{joint}_pos" for joint in ("x", "y", "yaw", "roll", "swing")}
     names["actuator:motor"] = "motor_torque"
     readings = [Reading(Match((n,), target, read_name(n, set()), 1.0), "") for target, n in names.items()]
-    asked = {u.name: u for u in rough_unknowns(model, Machine.of(model), readings)}
+    asked = {u.name: u for u in rough_parameters(model, Machine.of(model), readings)}
     assert {"wheel_mass", "roll_damping", "roll_armature", "swing_frictionloss", "base_mass"} <= {*asked}
     assert not [name for name in asked if name.startswith(("x_", "y_", "yaw_"))]
     assert {f"base_{what}_{axis}" for what in ("com", "inertia") for axis in "xyz"} <= {*asked}

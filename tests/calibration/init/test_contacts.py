@@ -8,11 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from sipe_bayes.calibration.init.cases import rough_unknowns
-from sipe_bayes.calibration.init.draft import Unknown
+from sipe_bayes.calibration.init.cases import rough_parameters
+from sipe_bayes.calibration.init.draft import Proposal
+from sipe_bayes.calibration.init.parameters import as_parameters, nameless
 from sipe_bayes.calibration.init.propose import propose
-from sipe_bayes.calibration.init.unknowns.candidates import as_parameters
-from sipe_bayes.calibration.init.unknowns.contacts import nameless
 from sipe_bayes.calibration.machine import Machine
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -20,11 +19,11 @@ from sipe_bayes.envs.targets import bind
 from sipe_bayes.simulation.simulator import Simulator
 
 
-def asked(bodies: str, floor: str = "") -> dict[str, Unknown]:
+def asked(bodies: str, floor: str = "") -> dict[str, Proposal]:
     """Unknowns of contacts, all of which can be written into the model together."""
     text = f'<mujoco><worldbody><geom name="floor" type="plane" size="3 3 .1" {floor}/>{bodies}</worldbody></mujoco>'
     model = mujoco.MjModel.from_xml_string(text)
-    unknowns = [u for u in rough_unknowns(model, Machine.of(model), []) if any("geom:" in t for t in u.targets)]
+    unknowns = [u for u in rough_parameters(model, Machine.of(model), []) if any("geom:" in t for t in u.targets)]
     if unknowns:
         MjcfEnvironment.build(text, as_parameters(model, unknowns), [], [])
     return {unknown.name: unknown for unknown in unknowns}
@@ -43,7 +42,7 @@ def rover(tyre: str, skid: str = "", chassis: str = "", named: bool = True) -> s
     return f'<body name="chassis"><freejoint/>{geom("hull", chassis)}{wheels}{castor}</body>'
 
 
-def frictions(unknowns: dict[str, Unknown]) -> dict[str, tuple[tuple[str, ...], float]]:
+def frictions(unknowns: dict[str, Proposal]) -> dict[str, tuple[tuple[str, ...], float]]:
     """Geoms and lower bounds."""
     return {
         name: (tuple(t.removeprefix("geom:").removesuffix(".friction") for t in unknown.targets), unknown.low)

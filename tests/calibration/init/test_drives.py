@@ -83,5 +83,5 @@ def test_the_gain_of_a_tendon_is_asked_for_unless_its_command_is_a_force(
     draft = driven(tmp_path, model, "", 1.0, column)
     units = {"u": "1", "winch_torque": "N m" if cable == FIXED else "N", "cable_N": "N"}
     assert [reading.unit for reading in draft.commands] == [units[column]]
-    assert ("fan_gain" in {unknown.name for unknown in draft.proposed}) == (column == "u")
+    assert ("fan_gain" in {unknown.name for unknown in draft.free}) == (column == "u")
     assert any("all forces are relative to" in doubt for doubt in draft.open_doubts) == (column == "u")

@@ -64,7 +64,7 @@ def test_a_quadrotor(tmp_path: Path) -> None:
     assert readings["body:frame.position"].unit == "m"
     assert readings["sensor:gyro"].unit == "deg/s"
     assert readings["sensor:gyro"].notes[0] == "deg/s: as fast as what is measured turns"
-    unknowns = {unknown.name: unknown for unknown in draft.proposed}
+    unknowns = {unknown.name: unknown for unknown in draft.free}
     assert unknowns["rotors_gain"].targets == tuple(f"actuator:{name}.gain" for name in ROTORS)
     assert {"frame_inertia_x", "frame_inertia_y", "frame_com_x"} <= set(unknowns)
     assert isinstance(draft.window, float)

@@ -12,7 +12,7 @@ import pytest
 
 from sipe_bayes.calibration.init.draft import Draft
 from sipe_bayes.calibration.init.propose import propose
-from sipe_bayes.calibration.init.unknowns.choice import RELATIVE
+from sipe_bayes.calibration.init.selection import RELATIVE
 
 PLACES = np.array([(0.2, 0.15), (0.2, -0.15), (-0.2, 0.15), (-0.2, -0.15)])
 SITES = "".join(f'<site name="t{k}" pos="{x} {y} 0"/>' for k, (x, y) in enumerate(PLACES))
@@ -53,7 +53,7 @@ def flown(folder: Path, late: int, unit: str) -> Draft:
 @pytest.mark.parametrize("late", [4, 0])
 def test_a_delay_of_what_flies_and_two_masses_that_look_alike(tmp_path: Path, late: int) -> None:
     draft = flown(tmp_path, late, "N")
-    left_out = {unknown.name: unknown.left_out for unknown in draft.unknowns}
+    left_out = {unknown.name: unknown.left_out for unknown in draft.parameters}
     print(draft.delay, left_out)
     assert round(draft.delay) == late
     assert ("delay" in left_out) == (late > 0)
@@ -63,10 +63,10 @@ def test_a_delay_of_what_flies_and_two_masses_that_look_alike(tmp_path: Path, la
 
 def test_forces_that_are_known_by_no_unit_are_relative_to_a_mass(tmp_path: Path) -> None:
     draft = flown(tmp_path, 4, "V")
-    left_out = {unknown.name: unknown.left_out for unknown in draft.unknowns}
+    left_out = {unknown.name: unknown.left_out for unknown in draft.parameters}
     print(draft.delay, left_out)
     assert round(draft.delay) == 4
     assert RELATIVE in (left_out["base_mass"], left_out["payload_mass"])
-    (gain,) = (unknown for unknown in draft.unknowns if unknown.name == "rotors_gain")
+    (gain,) = (unknown for unknown in draft.parameters if unknown.name == "rotors_gain")
     assert (gain.left_out, len(gain.targets)) == ("", 4)
     assert any("relative to" in doubt for doubt in draft.open_doubts)

@@ -51,7 +51,7 @@ def test_efforts_are_measured_with_their_sign_and_unit_and_make_forces_known(tmp
         "joint:elbow.force": ("mN m", -1, "effort_elbow"),
     }
     assert not any("no force is known" in doubt for doubt in draft.doubts)
-    assert {"upper_mass", "lower_mass"} <= {unknown.name for unknown in draft.proposed}
+    assert {"upper_mass", "lower_mass"} <= {unknown.name for unknown in draft.free}
     assert draft.config(tmp_path)
 
 

@@ -32,7 +32,7 @@ def judged(draft: Draft, plant: Plant) -> tuple[str, list[str]]:
     if (draft.clock.column, draft.clock.unit) != (plant.clock[0], plant.clock[1].replace("iso", "s")):
         faults.append((f"clock {draft.clock.column} in {draft.clock.unit}", False))
     if abs(draft.delay - plant.delay) > 1.1:
-        bounds = [(u.low, u.high) for u in draft.proposed if u.name == "delay"]
+        bounds = [(u.low, u.high) for u in draft.free if u.name == "delay"]
         asked = any(low <= plant.delay * plant.dt <= high for low, high in bounds)
         faults.append((f"delay {plant.delay}, not {draft.delay:.2f}", asked))
     word = "WRONG" if not all(asked for _, asked in faults) else "ASKED" if faults else "RIGHT"

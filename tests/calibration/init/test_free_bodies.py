@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from sipe_bayes.calibration.init.cases import rough_unknowns
+from sipe_bayes.calibration.init.cases import rough_parameters
 from sipe_bayes.calibration.init.draft import Draft, questions
 from sipe_bayes.calibration.init.matching import match_columns
 from sipe_bayes.calibration.init.propose import propose
@@ -44,7 +44,7 @@ def test_the_mass_of_a_free_body(tmp_path: Path, driven: bool) -> None:
     names = ["t", "push_N", "x", "y", "z", "qw", "qx", "qy", "qz", "stroke_m"][: len(rows[0])]
     logs = pd.DataFrame(rows, columns=names)
     (logs if driven else logs.drop(columns="push_N")).to_csv(tmp_path / "log.csv", index=False)
-    unknowns = [unknown.name for unknown in propose(path, [tmp_path / "log.csv"], tmp_path).unknowns]
+    unknowns = [unknown.name for unknown in propose(path, [tmp_path / "log.csv"], tmp_path).parameters]
     print(unknowns)
     assert ("puck_mass" in unknowns) == driven
     assert "puck_friction" in unknowns
@@ -162,7 +162,7 @@ def test_where_nothing_else_may_be_unknown_the_mass_is_proposed() -> None:
     """A body that nothing drives or touches: a configuration needs an unknown."""
     model = mujoco.MjModel.from_xml_string(PUSHED.format(pusher="", motor=""))
     model.geom_contype[:] = model.geom_conaffinity[:] = 0
-    assert [one.name for one in rough_unknowns(model, Machine.of(model), [])] == ["puck_mass"]
+    assert [one.name for one in rough_parameters(model, Machine.of(model), [])] == ["puck_mass"]
 
 
 @pytest.mark.parametrize(("geom", "said"), [("box", "ball.position, ball.orientation"), ("sphere", "ball.position")])

@@ -18,19 +18,20 @@ ARM = """<mujoco><compiler angle="radian"/><option timestep=".002" integrator="i
   <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass="0"/></body></worldbody>
   <actuator><position name="lift" joint="lift" kp="{kp}" kv=".8" ctrlrange="{ends}"/></actuator></mujoco>"""
 PLAIN = {"floor": "", "low": -1.5, "high": 1.5, "inertia": 0.005, "kp": 25, "ends": "-2 2"}
+STIFF = 2500  # N m/rad, with which the arm swings faster than its log
 Table = dict[str, np.ndarray]
 
 
-def made(off: bool = False) -> Table:
+def made(off: bool = False, kp: float = 25) -> Table:
     """A log of a servo that lifts an arm, with a drive that is off in its last third or is not."""
-    model = mujoco.MjModel.from_xml_string(ARM.format(**PLAIN).replace('damping=".2"', 'damping=".3"'))
+    model = mujoco.MjModel.from_xml_string(ARM.format(**{**PLAIN, "kp": kp}).replace('damping=".2"', 'damping=".3"'))
     data, rows, noise = mujoco.MjData(model), [], np.random.default_rng(0)
     for k in range(900):
         t = 0.02 * k
         goal = 0.5 * np.sin(1.7 * t) + 0.3 * np.sin(3.9 * t)
         rows.append((t, goal, float(data.qpos[0]) + noise.normal(0, 5e-4), float(data.qfrc_actuator[0])))
-        model.actuator_gainprm[0, 0] = 0.0 if off and k > 600 else PLAIN["kp"]
-        model.actuator_biasprm[0, 1:3] = (0.0, 0.0) if off and k > 600 else (-PLAIN["kp"], -0.8)
+        model.actuator_gainprm[0, 0] = 0.0 if off and k > 600 else kp
+        model.actuator_biasprm[0, 1:3] = (0.0, 0.0) if off and k > 600 else (-kp, -0.8)
         data.ctrl[:] = goal
         mujoco.mj_step(model, data, 10)
     return dict(zip(("time", "lift_goal", "lift_position", "current"), np.array(rows).T, strict=True))
@@ -58,6 +59,7 @@ CASES: dict[str, tuple[dict[str, object], Callable[[Table], None] | None, str]] 
     "step": ({"kp": 90_000}, None, "is too long for the gains of the servos"),
     "inertia": ({"inertia": 2.0}, None, "times as large as its geoms"),
     "contact": ({"floor": '<geom type="plane" size="2 2 .1" pos="0 0 .79"/>'}, None, "the model touches something"),
+    "slow": ({"kp": STIFF}, None, "are slower than the servos"),
     "off": ({}, None, "is not at its set-point from"),
 }
 
@@ -80,7 +82,7 @@ def test_nothing_is_odd_in_a_clean_log(tmp_path: Path) -> None:
 @pytest.mark.parametrize("code", CASES)
 def test_what_is_odd_is_named(code: str, tmp_path: Path) -> None:
     model, change, words = CASES[code]
-    table = made(off=code == "off")
+    table = made(off=code == "off", kp=STIFF if code == "slow" else 25)
     if change is not None:
         change(table)
     doubts = said(tmp_path, table, model)

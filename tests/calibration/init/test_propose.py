@@ -70,7 +70,7 @@ def test_a_spring_that_the_model_lacks_hides_no_delay(kind: str, variant: int, s
     joint = f"joint:{KINDS[kind].joints[0]}"
     told = spring > 0 and kind != "servo"  # whose gain does the same
     assert [joint in doubt for doubt in draft.doubts if "a spring" in doubt] == [True] * told
-    asked = [target for unknown in draft.proposed for target in unknown.targets if "spring" in unknown.name]
+    asked = [target for unknown in draft.free for target in unknown.targets if "spring" in unknown.name]
     assert asked == [f"{joint}.stiffness", f"{joint}.springref"] * told
 
 
@@ -88,7 +88,7 @@ def test_samples_that_are_missing_hide_nothing(tmp_path: Path) -> None:
     (tmp_path / "log.txt").write_text(text)
     draft = propose(tmp_path / "model.xml", [tmp_path / "log.txt"], tmp_path)
     assert not wrong(draft, truth)
-    assert {"upper_arm_mass", "forearm_mass", "shoulder_damping"} <= {unknown.name for unknown in draft.proposed}
+    assert {"upper_arm_mass", "forearm_mass", "shoulder_damping"} <= {unknown.name for unknown in draft.free}
     missing, unused = sorted(doubt for doubt in draft.open_doubts if "no numbers" in doubt)
     assert missing.startswith("'joint_1_pos': cells that are no numbers (3) are read as missing; correct the log")
     assert unused.startswith("'temp'")
@@ -115,7 +115,7 @@ def test_where_nothing_shows_all_is_asked_for(tmp_path: Path) -> None:
     still = 1e-3 * np.random.default_rng(0).standard_normal(len(time))
     pd.DataFrame({"time": time, "angle": still, "torque": 0.0 * time}).to_csv(tmp_path / "log.csv", index=False)
     draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
-    assert draft.proposed
+    assert draft.free
     assert any("all are free" in doubt for doubt in draft.open_doubts)
 
 

@@ -143,5 +143,5 @@ def test_what_is_being_done_is_told(tmp_path: Path) -> None:
         "reading the logs",
         "units and signs",
         "zeros of joints",
-        "delay and unknowns",
+        "delay and parameters",
     ]

@@ -6,7 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from sipe_bayes.calibration.init.unknowns.resistance import of_tendons
+from sipe_bayes.calibration.column_names import read_name
+from sipe_bayes.calibration.init.draft import Reading
+from sipe_bayes.calibration.init.matching import Match
+from sipe_bayes.calibration.init.parameters import candidates
 from sipe_bayes.calibration.machine import Machine, Sizes
 
 HAND = """<mujoco><compiler angle="radian"/><worldbody><site name="anchor" pos="-.03 0 -.01"/>
@@ -25,10 +28,12 @@ HAND = """<mujoco><compiler angle="radian"/><worldbody><site name="anchor" pos="
 def asked(*driven: str, flexor: str = "") -> list[str]:
     model = mujoco.MjModel.from_xml_string(HAND.format(flexor))
     machine = Machine.of(model)
-    sizes = Sizes.of(model, machine, None, None)
-    unknowns = of_tendons(model, [a for a in machine.actuators if a.name in driven], sizes)
-    assert all(u.high > 0 and u.relative == ("stiffness" in u.name) for u in unknowns)
-    return [unknown.name for unknown in unknowns]
+    targets = ("joint:mcp.position", *(f"actuator:{name}" for name in driven))
+    readings = [Reading(Match((target,), target, read_name("u", set()), 1.0), "N") for target in targets]
+    proposed = candidates(model, machine, readings, Sizes.of(model, machine, None, None))
+    tendons = [one for one in proposed if one.targets[0].startswith("tendon:")]
+    assert all(one.high > 0 and one.relative == ("stiffness" in one.name) for one in tendons)
+    return [one.name for one in tendons]
 
 
 PULLED = ["flexor_damping", "flexor_frictionloss", "flexor_armature"]

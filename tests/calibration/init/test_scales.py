@@ -82,7 +82,7 @@ def test_counts_of_an_encoder_and_a_duty_of_a_battery(tmp_path: Path, counts: in
     problem = prepare(tmp_path / "calibrate.toml", 1)
     held = np.round(255 * duty) / 255 * volts
     np.testing.assert_allclose(problem.train.actions[0, :400, 0], held[:400], atol=2e-4)
-    assert {"motor_resistance", "motor_constant"} & {u.name for u in draft.unknowns}
+    assert {"motor_resistance", "motor_constant"} & {u.name for u in draft.parameters}
 
 
 def test_a_duty_without_a_supply_stays_open(tmp_path: Path) -> None:

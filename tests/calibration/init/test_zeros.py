@@ -67,7 +67,7 @@ def test_a_height_above_the_floor_is_no_position_of_a_slide(tmp_path: Path, ref:
     assert (reading.zero, reading.unsure) == pytest.approx((0.5 - ref if floor else 0.0, 0.0))
     assert any("where the body 'carriage' is in the world" in note for note in reading.notes) == floor
     assert ("zero 0." in summary(draft, "calibrate.toml")[0]) == floor
-    names = {target for unknown in draft.proposed for target in unknown.targets}
+    names = {target for unknown in draft.free for target in unknown.targets}
     assert "geom:foot.solref_timeconst" in names, "what touches the floor in the log is asked for"
 
 
@@ -78,7 +78,7 @@ def test_what_stays_above_the_floor_is_asked_for_no_contact(tmp_path: Path) -> N
     (tmp_path / "model.xml").write_text(HOPPER.format(soft=0.02, ref=0, damping=2.0, mass=1.0))
     pd.DataFrame({"time": time, HEIGHT: height, "lift_force_N": force}).to_csv(tmp_path / "log.csv", index=False)
     draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
-    assert not any("geom:" in target for unknown in draft.unknowns for target in unknown.targets)
+    assert not any("geom:" in target for unknown in draft.parameters for target in unknown.targets)
 
 
 @pytest.mark.parametrize("zero", [0.8, -1.1])
@@ -94,7 +94,7 @@ def test_the_zero_of_an_encoder_is_asked_for_where_simulations_alone_tell_it(tmp
     (reading,) = draft.measurements
     assert abs(reading.zero - zero) < reading.unsure, (reading.zero, reading.unsure)
     assert any("which these logs alone tell" in doubt for doubt in draft.open_doubts)
-    assert "hinge_rad_zero" in {unknown.name for unknown in draft.proposed}
+    assert "hinge_rad_zero" in {unknown.name for unknown in draft.free}
     (tmp_path / "calibrate.toml").write_text(toml_of(draft, "sipe init"))
     problem = prepare(tmp_path / "calibrate.toml", 1)
     assert np.allclose(problem.train[0].observations[:5, 0], table["hinge_rad"][:5] - reading.zero, atol=1e-4)

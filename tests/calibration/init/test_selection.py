@@ -1,4 +1,4 @@
-"""Which unknowns `sipe init` asks for: what the logs tell well enough, though another one does nearly the same."""
+"""Which parameters `sipe init` frees: what the logs tell well enough, though another one does nearly the same."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 
 from sipe_bayes.calibration.column_names import read_name
-from sipe_bayes.calibration.init.draft import Reading, Unknown
+from sipe_bayes.calibration.init.draft import Proposal, Reading
 from sipe_bayes.calibration.init.matching import Match, match_columns
+from sipe_bayes.calibration.init.parameters import candidates, least_of, springs
 from sipe_bayes.calibration.init.readings import first_readings
 from sipe_bayes.calibration.init.regression import Outcome
+from sipe_bayes.calibration.init.selection import Fit, delay_of, find_springs, select_identifiable, widen_bounds
 from sipe_bayes.calibration.init.tables import Clock
-from sipe_bayes.calibration.init.unknowns.candidates import candidates, least_of, springs
-from sipe_bayes.calibration.init.unknowns.choice import roomy, sprung, told_apart
-from sipe_bayes.calibration.init.unknowns.effects import Fit, delay_of
 from sipe_bayes.calibration.machine import Machine, Sizes
 
 
@@ -39,9 +38,9 @@ def test_what_is_nearly_the_same_is_asked_for_where_the_logs_tell_it(
     rng = np.random.default_rng(0)
     basis = np.linalg.qr(rng.standard_normal((400, 2)))[0]
     both = np.stack([500 * basis[:, 0], size * (np.sqrt(1 - share**2) * basis[:, 0] + share * basis[:, 1])], axis=1)
-    unknowns = [Unknown(name, (), 0.0, 1.0, False, "") for name in ("damping", "friction")]
-    fit = Fit(np.full(2, 0.5), np.ones(2), both)
-    first, second = told_apart(unknowns, fit, np.full(2, 0.5 - away))
+    unknowns = [Proposal(name, (), 0.0, 1.0, False, "") for name in ("damping", "friction")]
+    fit = Fit(np.full(2, 0.5), np.full(2, 0.5 - away), both)
+    first, second = select_identifiable(unknowns, fit)
     assert not first.left_out
     assert (not second.left_out) is kept, second.left_out
 
@@ -67,8 +66,8 @@ SERVO = 'biastype="affine" biasprm="0 0 -5"'
 def test_bounds_that_a_fit_presses_against_are_widened(
     target: str, relative: bool, bounds: tuple[float, float], theta: float, wider: tuple[float, float]
 ) -> None:
-    unknown = Unknown("it", (target,), *bounds, relative, "as in the model")
-    kept = roomy(mujoco.MjModel.from_xml_string(FILTERED), unknown, theta)
+    unknown = Proposal("it", (target,), *bounds, relative, "as in the model")
+    kept = widen_bounds(mujoco.MjModel.from_xml_string(FILTERED), unknown, theta)
     assert (kept.low, kept.high) == pytest.approx(wider, abs=0.01)
     assert ("wider" in kept.note) is (wider != bounds)
 
@@ -113,14 +112,13 @@ def test_a_delay_that_the_logs_may_have_is_asked_for(behind: tuple[float, ...], 
 def test_a_spring_is_asked_for_where_one_shows(size: float, theta: float, shown: bool) -> None:
     """Of 4 N m/rad at most: with what it is about, and where it rests between the ends of the motion."""
     basis = np.linalg.qr(np.random.default_rng(0).standard_normal((400, 2)))[0]
-    fit = Fit(np.array([0.5, theta]), np.ones(2), basis * [500.0, size])
+    fit = Fit(np.array([0.5, theta]), np.zeros(2), basis * [500.0, size])
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><body name="arm"><joint name="j"/><geom size=".1"/></body></worldbody></mujoco>'
     )
-    mass = Unknown("mass", (), 0.0, 1.0, False, "")
-    spring = Unknown("j_spring", ("joint:j.stiffness",), 0.0, 4.0, False, "")
+    spring = Proposal("j_spring", ("joint:j.stiffness",), 0.0, 4.0, False, "")
     states = np.array([[0.0, -0.7, 0.0], [0.1, 0.2, 0.0]])
-    asked, lines = sprung(model, [mass], [spring], fit, states)
+    asked, lines = find_springs(model, [spring], fit, states)
     assert [(u.name, u.targets) for u in asked] == [
         ("j_spring", ("joint:j.stiffness",)),
         ("j_spring_rest", ("joint:j.springref",)),
@@ -201,8 +199,8 @@ def test_the_damping_of_a_velocity_servo_has_no_least_factor() -> None:
     """It is negative in the model and bounded by nothing below: its factor had none but infinity."""
     model = mujoco.MjModel.from_xml_string(FILTERED.replace('dyntype="filter" dynprm="0.02"', SERVO))
     name = model.actuator(0).name
-    unknown = Unknown("servo", (f"actuator:{name}.bias_velocity",), 0.25, 4.0, True, "")
+    unknown = Proposal("servo", (f"actuator:{name}.bias_velocity",), 0.25, 4.0, True, "")
     assert least_of(model, unknown) == -np.inf
-    kept = roomy(model, unknown, 0.0)
+    kept = widen_bounds(model, unknown, 0.0)
     assert np.isfinite([kept.low, kept.high]).all()
     assert 0 < kept.low < 0.25

@@ -1,1 +1,0 @@
-"""What may be unknown of a model, between which bounds, and what of it the logs tell."""
