@@ -85,7 +85,8 @@ from sipe_bayes.likelihood.wild_samples import wild_residuals
 from sipe_bayes.likelihood.windows import Linearisation, Windows, inward
 
 _DAMPINGS = np.array([0.03, 1.0, 30.0, 1000.0])  # tried together, times the damping of the step before
-_SHARES = np.array([1.0, 0.3, 0.0])  # of a change of initial states that are tried together, segment by segment
+_SHARES = np.array([1.0, 0.3, 0.0])  # of a change of initial states that are tried, segment by segment
+_FORETOLD = 0.75  # of the gain that the linearisation expects: with less it does not hold
 _DIFFERENCE = 0.3  # conditional posterior sds that a finite difference is long
 _THROUGH_IMPACTS = 100  # draws from the prior, of which the best are followed where simulations jump
 _SCOUTED_STEPS = 16  # after which the next of them is followed: most fits that settle do so by then
@@ -579,7 +580,7 @@ class SegmentSolver:
                 state = self._recorded(state, self._optimum(state, after, lin, moments, keep, view, False, True))
                 return replace(state, here=replace(after, part=part, residual=None, starts_jacobian=None))
             return self._ended(state, after, lin, moments, keep, view, settled or stuck)
-        foretold = trial.gained > 0.75 * trial.expected
+        foretold = trial.gained > _FORETOLD * trial.expected
         kept = lin.jacobian[..., view.num_theta :] if foretold and view.num_start else None
         after = replace(after, starts_jacobian=None if kept is None else np.ascontiguousarray(kept))
         if trial.gained <= 0:
@@ -684,9 +685,14 @@ class SegmentSolver:
                     return _Trial(here.theta, starts, lin.residual, 0.0, expected, here.damping, held), scale
             thetas.append(theta)
             changes.append(solved.blocks(move))
-        stacked = np.stack(thetas)
-        all_starts, residuals, valid, shares = stepped_starts(view, noise, stacked, starts, np.stack(changes))
+        stacked, moved = np.stack(thetas), np.stack(changes)
+        residuals, valid = view.residuals(stacked, starts + moved)
+        all_starts, shares = starts + moved, np.ones(moved.shape[:2])
         best, values = best_step(stacked, all_starts, residuals, valid, energy, now, 0.1 * tolerance)
+        if view.num_start and now - values[best] < _FORETOLD * expected and view.has_room(2 * len(thetas)):
+            made = shorter_starts(view, noise, stacked, starts, moved, residuals, valid)
+            all_starts, residuals, valid, shares = made
+            best, values = best_step(stacked, all_starts, residuals, valid, energy, now, 0.1 * tolerance)
         damping = float(here.damping * _DAMPINGS[best])
         gained = now - float(values[best])
         held = np.where(shares[best] < 1, np.maximum(10 * held, 1.0), np.where(held > 0.1, 0.1 * held, 0.0))
@@ -975,8 +981,14 @@ def is_back(theta: FloatArray, begin: FloatArray, optimum: FloatArray, precision
     return bool((left < np.maximum(1.0, 0.1 * whole)).all())
 
 
-def stepped_starts(
-    view: Windows, noise: Noise, thetas: FloatArray, starts: FloatArray, changes: FloatArray
+def shorter_starts(
+    view: Windows,
+    noise: Noise,
+    thetas: FloatArray,
+    starts: FloatArray,
+    changes: FloatArray,
+    residuals: FloatArray,
+    valid: BoolArray,
 ) -> tuple[FloatArray, FloatArray, BoolArray, FloatArray]:
     """Initial states of steps, each segment's change as long as fits that segment best, by itself.
 
@@ -988,16 +1000,16 @@ def stepped_starts(
         thetas: (M, N), of the steps.
         starts: (K, D), where they begin.
         changes: (M, K, D), of the whole steps.
+        residuals: (M, K, L, C), after the whole steps.
+        valid: (M,), which of these are.
 
     Returns:
         Starts (M, K, D), residuals (M, K, L, C), which of the M are valid, and the share of each change (M, K).
     """
-    if not view.num_start:
-        return starts + changes, *view.residuals(thetas, starts + changes), np.ones(changes.shape[:2])
     tried = starts + _SHARES[:, None, None, None] * changes
-    shape = tried.shape[:2]
-    flat = tried.reshape(-1, *starts.shape)
-    residuals, valid = view.residuals(np.tile(thetas, (len(_SHARES), 1)), flat)
+    shape, flat = tried.shape[:2], tried.reshape(-1, *starts.shape)
+    more, good = view.residuals(np.tile(thetas, (len(_SHARES) - 1, 1)), flat[len(thetas) :])
+    residuals, valid = np.concatenate([residuals, more]), np.concatenate([valid, good])
     energies = view.energies(flat, residuals, noise)
     energies[~valid] = np.inf
     best = energies.reshape(*shape, -1).argmin(0)

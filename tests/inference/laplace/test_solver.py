@@ -13,7 +13,7 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.inference.laplace.options import LaplaceTuning, SolverTuning
-from sipe_bayes.inference.laplace.solver import SegmentSolver, SolverState, is_back, spread_segments, stepped_starts
+from sipe_bayes.inference.laplace.solver import SegmentSolver, SolverState, is_back, shorter_starts, spread_segments
 from sipe_bayes.likelihood import Segments, StateSpace, bind
 from sipe_bayes.likelihood.noise import Noise
 from sipe_bayes.likelihood.state_space.chain import Chain
@@ -307,7 +307,9 @@ def test_each_segment_takes_as_much_of_its_step_as_fits_it_best() -> None:
     best = windows.fit_starts(theta, noise)[0]
     change = best - windows.no_starts()
     change[1], change[2] = 3.3 * change[1], -change[2]
-    starts, residual, valid, shares = stepped_starts(windows, noise, theta[None], windows.no_starts(), change[None])
+    begin = windows.no_starts()
+    whole = windows.residuals(theta[None], (begin + change)[None])
+    starts, residual, valid, shares = shorter_starts(windows, noise, theta[None], begin, change[None], *whole)
     assert valid.all()
     assert shares[0, :3].tolist() == [1.0, 0.3, 0.0]
     assert starts[0, 0] == pytest.approx(best[0])
