@@ -214,8 +214,8 @@ def environments() -> str:
     rows = [(f"`{row['name']}`", *(row[k] for k in cells)) for row in tasks()]
     return f"""# Environments
 
-`sipe envs` lists them; `sipe envs Door` prints one with what every parameter writes and a measured sensitivity. What
-they are and how they differ from the published ones: [environments](../environments.md).
+`sipe envs` lists them; `sipe envs Door` prints one with what every parameter writes. What they are
+and how they differ from the published ones: [environments](../environments.md).
 
 {table(("environment", *cells), rows)}"""
 

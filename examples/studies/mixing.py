@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from _c2st import c2st
 from _kept import fits, keep
 
 import sipe_bayes as sipe
@@ -35,7 +36,6 @@ from sipe_bayes.calibration.check import simulated_log
 from sipe_bayes.calibration.config import load_config
 from sipe_bayes.calibration.study import study_of_task
 from sipe_bayes.core.files import write_text
-from sipe_bayes.diagnostics.scores import c2st
 from sipe_bayes.inference.mcmc import MCMC, MCMCState
 from sipe_bayes.posterior import Particles
 

@@ -26,13 +26,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from _c2st import c2st
 from _kept import ensure, fits
 
 import sipe_bayes as sipe
 from sipe_bayes.core.files import write_text
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.scores import c2st
 from sipe_bayes.inference.laplace.state_space.state import ChainOptimum
 from sipe_bayes.inference.laplace.strategy import mixture
 from sipe_bayes.likelihood.state_space.chain import Chain

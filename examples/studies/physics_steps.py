@@ -136,7 +136,7 @@ def one_log(name: str, timestep: float, of_machine: float, seed: int) -> Seen:
     held = [(low <= theta) & (theta <= high) for low, high in ends]
     widths = [high - low for low, high in ends]
     z = (posterior.mean.numpy() - theta) / posterior.stddev.numpy()
-    named = looks.alarm and PhysicsStep().sentence(WORLD) in looks.text
+    named = looks.alarm and PhysicsStep().sentence(WORLD) in looks.cause
     blocked = any(item.severity is Severity.BLOCKING for item in method.findings)
     return Seen(z, held[0], held[1], widths[1] / widths[0], looks.alarm, named, blocked)
 

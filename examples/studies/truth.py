@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from _c2st import c2st
 
 import sipe_bayes as sipe
 from sipe_bayes.core.files import write_text
-from sipe_bayes.diagnostics.scores import c2st
 from sipe_bayes.posterior import Particles, Posterior
 
 HERE = Path(__file__).parent

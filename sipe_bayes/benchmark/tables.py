@@ -103,13 +103,13 @@ MEASURES = {
     m.name: m
     for m in (
         Measure("accuracy", "1 - |mean - truth|, mean over parameters", 1, 3, _of_scores(lambda s: s.mean_accuracy)),
-        Measure("worst accuracy", "the same of the worst parameter", 1, 3, _of_scores(lambda s: s.min_accuracy)),
+        Measure("worst accuracy", "the same of the worst parameter", 1, 3, _of_scores(lambda s: min(s.accuracy))),
         Measure(
             "spread",
             "accuracy of the best parameter less that of the worst",
             -1,
             3,
-            _of_scores(lambda s: s.max_accuracy - s.min_accuracy),
+            _of_scores(lambda s: max(s.accuracy) - min(s.accuracy)),
         ),
         Measure(
             "CRPS skill",

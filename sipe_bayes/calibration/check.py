@@ -2,7 +2,7 @@
 
 Truths are drawn from the prior, the recorded experiment is simulated at each of them with the noise of the recording
 (``sipe_bayes.likelihood.replicas``), the estimator is fitted to each simulated log, and ``diagnostics.coverage``
-compares. Where the answer is clear sooner (``diagnostics.sequential``) the rest is spared. Each fit has a seed of its
+compares. Where the answer is clear sooner the rest is spared. Each fit has a seed of its
 own: with one seed the errors of sampling would be the same in all. An amortised estimator is trained once, so that
 its errors are, and then conditions on each log. Every fit is one file, so an interrupted check goes on.
 
@@ -30,8 +30,7 @@ from sipe_bayes.core.seeding import seed_integer, torch_generator
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.core.validation import whole
-from sipe_bayes.diagnostics.coverage import FEWEST, CalibrationCheck, check_draws, mass_below
-from sipe_bayes.diagnostics.sequential import clearly_wrong
+from sipe_bayes.diagnostics.coverage import FEWEST, CalibrationCheck, check_draws, clearly_wrong, mass_below
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recalibrated import Recalibrated
 from sipe_bayes.likelihood import Replicas

@@ -18,7 +18,7 @@ from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.diagnostics.evaluate import compare_errors
-from sipe_bayes.diagnostics.identifiability import ridges, worth_measuring
+from sipe_bayes.diagnostics.identifiability import ridges
 from sipe_bayes.diagnostics.records import ChannelScore, LogReport, Ridge, improvement
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -101,14 +101,6 @@ class Marginals:
         known = (before < (1 - THRESHOLDS.well_determined) / math.sqrt(UNIFORM_PRECISION)) & (moved < _MOVED)
         draws = posterior.values(_DRAWS, generator=torch.Generator().manual_seed(seed))
         return cls(posterior.space, most_probable(posterior), sd, 1 - sd / before, draws, known, natural)
-
-    def worth_measuring(self) -> list[Finding]:
-        """The one parameter on which most of the others hang, if there is one."""
-        one = worth_measuring(self.space, self.draws, self.contraction.tolist())
-        if one is None:
-            return []
-        name, others = one
-        return [finding(Code.WORTH_MEASURING, parameters=[name], count=len(others), others=", ".join(others))]
 
     def summaries(self, further: Posterior | None = None) -> list[ParameterSummary]:
         """One for each parameter.
@@ -235,8 +227,15 @@ def unmeasured_starts(
         wanted = ("position", "orientation") if int(model.jnt_type[joint]) == _FREE else ("orientation",)
         seen = {reading.quantity for reading in simulator.environment.poses if reading.joint == joint}
         missing = [f"body:{body}.{quantity}" for quantity in wanted if quantity not in seen]
-        code = Code.HELD_OUT_AT_REST if isinstance(likelihood, StateSpace) else Code.STARTS_AT_REST
-        findings.append(finding(code, joint=name, needed=" and ".join(missing)))
+        severity, where, instead = None, "every window starts", ", or use likelihood = 'state_space'"
+        if isinstance(likelihood, StateSpace):
+            severity, where, instead = (
+                Severity.CAUTION,
+                "simulations of held-out logs start",
+                " to believe their errors",
+            )
+        about = functools.partial(finding, Code.STARTS_AT_REST, severity=severity, joint=name)
+        findings.append(about(where=where, needed=" and ".join(missing), instead=instead))
     return findings
 
 
@@ -291,7 +290,8 @@ def worse_in_training(windows: BoundLikelihood, theta: FloatArray, scores: Seque
 
 def _of_log(report: LogReport, note: Finding) -> Severity:
     """What the user should read is a caution; that all samples passed through unchanged is none."""
-    return Severity.CAUTION if report.suspect and note.code is not Code.LOG_CLOCK else note.severity
+    unchanged = note.code is Code.LOG_CLOCK and not report.resampled
+    return Severity.CAUTION if report.suspect and not unchanged else note.severity
 
 
 def of_logs(reports: Sequence[LogReport]) -> list[Finding]:

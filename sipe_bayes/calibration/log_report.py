@@ -67,9 +67,9 @@ def report_of(
         clipped=clipped,
         findings=(
             note(
-                Code.LOG_CLOCK if grid.regular else Code.LOG_RESAMPLED,
+                Code.LOG_CLOCK,
                 samples=len(raw.time),
-                rate=f"{1 / grid.dt:.4g} Hz",
+                done="passed through unchanged" if grid.regular else f"resampled to {1 / grid.dt:.4g} Hz",
                 own_rate=f"{1 / float(np.median(np.diff(raw.time))):.4g} Hz",
                 jitter_ms=1e3 * jitter,
             ),

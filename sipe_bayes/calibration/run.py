@@ -42,9 +42,8 @@ from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept, fingerprint_of
 from sipe_bayes.core.files import installed_version
 from sipe_bayes.core.findings import Code, Finding, Findings, Guard, Outcome, finding
 from sipe_bayes.core.validation import at_least
-from sipe_bayes.diagnostics.agreement import Disagreement, LogEstimates, disagreement
+from sipe_bayes.diagnostics.agreement import disagreement
 from sipe_bayes.diagnostics.bands import band_coverage
-from sipe_bayes.diagnostics.records import Mixing
 from sipe_bayes.diagnostics.result import Calibration
 from sipe_bayes.envs.unknowns import bounded_by_nature
 from sipe_bayes.inference.base import Estimator
@@ -52,6 +51,7 @@ from sipe_bayes.inference.recorded import Progress, digest
 from sipe_bayes.inference.registry import estimator_class
 from sipe_bayes.likelihood import StateSpace, bind, process_noise_findings
 from sipe_bayes.posterior import Particles
+from sipe_bayes.structure.discrepancy import LogEstimate
 
 S = TypeVar("S")
 
@@ -147,8 +147,8 @@ class _Answers:
     recorded: Problem
     fitted: Problem
     fit: Outcome[Fit]
-    alone: LogEstimates
-    conflict: Disagreement | None
+    alone: list[LogEstimate]
+    conflict: Finding | None
     lacks: Lacking
     further: Particles | None
     predictions: Outcome[Predictions]
@@ -171,12 +171,12 @@ def _checked(problem: Problem, method: Estimator, first: Calibration, checks: Ch
     own = tame.otherwise(problem)
     states = guard.run("states of the fit", lambda: from_fitted_states(problem, method))
     fit = check(Check.STARTS, lambda: Fit.of(states.value, method, theta.value, checks))
-    alone = check(Check.LOGS, lambda: one_by_one(own, fit.value, seed, checks)).otherwise(LogEstimates())
-    conflict = guard.run("agreement of the logs", lambda: disagreement(space, alone.estimates)).otherwise(None)
+    alone = check(Check.LOGS, lambda: one_by_one(own, fit.value, checks)).otherwise([])
+    conflict = guard.run("agreement of the logs", lambda: disagreement(space, alone)).otherwise(None)
     fitted = replace(own, train=replace(own.train, states=states.otherwise(problem).train.states))
     lacks = check(
         Check.LACKING,
-        lambda: lacking(fitted, method, fit.value, posterior, alone.estimates, conflict is not None, checks),
+        lambda: lacking(fitted, method, fit.value, posterior, alone, conflict is not None, checks),
     ).otherwise(NOTHING_ASKED)
     further = guard.run("intervals with what the model lacks", lambda: lacks.further(space)).otherwise(None)
     doubted = conflict is not None or (lacks.misfit is not None and lacks.misfit.alarm)
@@ -210,7 +210,6 @@ def _described(
     ).otherwise(first.parameters)
     ridges = guard.run("ridges", lambda: marginals.value.ridges).otherwise([])
     noise = guard.run("noise of the channels", lambda: answers.fit.value.channel_noise()).otherwise({})
-    mixing = guard.run("mixing of the chains", lambda: _mixing(method)).otherwise(None)
     held = answers.bands.get("holdout")
     bands = guard.run(
         "coverage of the bands", lambda: held and band_coverage(predictions.value.windows["holdout"], *held)
@@ -231,7 +230,7 @@ def _described(
         misfit=lacks.misfit,
         outside=list(answers.place.logs),
         noise=noise,
-        mixing=mixing,
+        mixing=method.diagnostics.get("mixing", {}),
         logs=guard.run("samples left out of each log", lambda: with_wild(problem, method)).otherwise(first.logs),
         checked=not guard.is_late,
     )
@@ -259,27 +258,21 @@ def _looks(
         "rigid bodies": lambda: no_rigid_bodies(problem.environment, result.posterior, method.seed),
         "diagnostics of the checks": lambda: [
             *(
-                finding(Code.CHECKS_SKIPPED, checks=Check.LOGS.value, log=name, reason=f"log {name} gives no optimum")
-                for name in answers.alone.skipped
+                finding(Code.CHECKS_SKIPPED, checks=Check.LOGS.value, log=name, reason="the simulation diverges")
+                for name in (log.name for log in answers.alone if not log.information.any())
             ),
             *lacks.findings,
             *place.findings,
         ],
         "drifting noise": lambda: drifting(drifts),
         "uneven targets": lambda: uneven_targets(problem.environment),
-        "disagreement": lambda: [] if answers.conflict is None else [answers.conflict.finding],
-        "worth measuring": lambda: marginals.value.worth_measuring(),
-        "ridges to resolve": lambda: [ridge.finding(Code.RIDGE_TO_RESOLVE) for ridge in result.ridges],
+        "disagreement": lambda: [] if answers.conflict is None else [answers.conflict],
+        "ridges to resolve": lambda: [ridge.finding for ridge in result.ridges],
         "bounds and contraction": lambda: marginals.value.findings(answers.dead, wider),
         "errors that grew": lambda: compared.findings(result.holdout),
         "logs as read": lambda: of_logs(problem.reports),
         "process noise": lambda: _left_out(answers.fitted, method),
     }
-
-
-def _mixing(method: Estimator) -> Mixing | None:
-    measured = method.diagnostics.get("mixing")
-    return Mixing.of(measured, method.space.names) if measured else None
 
 
 def _own(method: Estimator, asked: bool) -> list[Finding]:

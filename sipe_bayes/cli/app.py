@@ -43,14 +43,14 @@ from sipe_bayes.inference.progress_bar import ProgressBar
 from sipe_bayes.inference.registry import ESTIMATORS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from rich.console import Console
 
     from sipe_bayes.core.findings import Findings
-    from sipe_bayes.diagnostics.catalogue import TaskDescription, TaskRow
     from sipe_bayes.diagnostics.records import ChannelScore
     from sipe_bayes.diagnostics.result import Calibration
+    from sipe_bayes.envs.task import Task
 
 app = typer.Typer(
     name="sipe",
@@ -169,18 +169,19 @@ def envs(
     name: Annotated[str | None, typer.Argument(help="A task; without it all are listed.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")] = False,
 ) -> None:
-    """The benchmark's environments; with NAME its parameters and how much each moves what is observed."""
+    """The benchmark's environments; with NAME its parameters and what each writes."""
     from sipe_bayes.core.files import to_json
-    from sipe_bayes.diagnostics.catalogue import describe, tasks, to_json_row
+    from sipe_bayes.diagnostics.catalogue import tasks, to_json_row
+    from sipe_bayes.envs.registry import make_task
 
     with exit_on_error():  # assets may not be installed
-        rows, one = (tasks(), None) if name is None else (None, describe(name))
+        rows, task = (tasks(), None) if name is None else ([], make_task(name))
     if as_json:
-        print(to_json(rows if one is None else to_json_row(one)))
-    elif one is None:
-        print_tasks(rows or [])
+        print(to_json(rows if task is None else to_json_row(task)))
+    elif task is None:
+        print_tasks(rows)
     else:
-        print_task(one)
+        print_task(task)
 
 
 def _console() -> Console:
@@ -192,7 +193,7 @@ def _console() -> Console:
     return console
 
 
-def print_tasks(rows: list[TaskRow]) -> None:
+def print_tasks(rows: Sequence[Mapping[str, object]]) -> None:
     """One line for every task, on standard output."""
     from rich.table import Table
 
@@ -202,43 +203,33 @@ def print_tasks(rows: list[TaskRow]) -> None:
     for t in rows:
         solved = f"{t['solved_by']} {t['solved_at']:g}"
         sizes = (str(n) for n in (t["parameters"], t["observations"], t["actions"], t["episode_steps"]))
-        table.add_row(t["name"], *sizes, solved, t["reproduces"])
+        table.add_row(str(t["name"]), *sizes, solved, str(t["reproduces"]))
     _console().print(table)
 
 
-def print_task(described: TaskDescription) -> None:
-    """A task's parameter table, what each does, its sensitivities and what changes nothing, on standard output."""
+def print_task(task: Task) -> None:
+    """A task's parameter table, and what each parameter does, on standard output."""
     from rich.table import Table
     from rich.text import Text
 
-    console = _console()
-    task = described["task"]
-    console.print(Text(f"{task['name']} ({task['id']}): {task['summary']}"))
+    from sipe_bayes.diagnostics.catalogue import describe
+
+    console, row = _console(), describe(task)
+    console.print(Text(f"{row['name']} ({row['id']}): {row['summary']}"))
     console.print(
         Text(
-            f"{task['observations']} observations, {task['actions']} actions, {task['episode_steps']} steps an "
-            f"episode; solved at a {task['solved_by']} of {task['solved_at']:g}; theta = 0.5 is {task['reproduces']}"
+            f"{row['observations']} observations, {row['actions']} actions, {row['episode_steps']} steps an episode; "
+            f"solved at a {row['solved_by']} of {row['solved_at']:g}; theta = 0.5 is {row['reproduces']}"
         )
     )
-    levels = described["sensitivity_at_theta"]
-    table = Table(
-        caption="moved at theta: rms change of the observations, in their spreads, for a 10 % change of the value"
-    )
-    for heading in ("parameter", "default", "from", "to", "unit", *(f"at {level:g}" for level in levels)):
+    table = Table()
+    for heading in ("parameter", "default", "from", "to", "unit"):
         table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right", no_wrap=True)
-    for p in described["parameters"]:
-        numbers = (f"{x:.4g}" for x in (p["default"], p["low"], p["high"]))
-        moved = (f"{x:.2g}" for x in p["sensitivity"])
-        table.add_row(p["name"], *numbers, p["unit"], *moved)
+    for p in task.space:
+        table.add_row(p.name, *(f"{x:.4g}" for x in (p.default, p.low, p.high)), p.unit)
     console.print(table)
-    for p in described["parameters"]:
-        console.print(Text(f"{p['name']} ({', '.join(p['writes'])}): {p['description']}"))
-    for name in described["changes_nothing"]:
-        console.print(
-            Text(f"{name} changes nothing under random actions: expect the prior back unless the actions do better")
-        )
-    for name, where in described["changes_nothing_at_theta"].items():
-        console.print(Text(f"{name} changes nothing at theta = {', '.join(f'{w:g}' for w in where)}"))
+    for p in task.space:
+        console.print(Text(f"{p.name} ({', '.join(p.targets)}): {p.description}"))
 
 
 def print_calibration(calibration: Calibration) -> None:

@@ -13,7 +13,7 @@ from sipe_bayes.core.validation import positive, whole
 
 if TYPE_CHECKING:
     from sipe_bayes.calibration.problem import Problem
-    from sipe_bayes.diagnostics.expected import Plan
+    from sipe_bayes.diagnostics.suggest import Plan
     from sipe_bayes.likelihood import Noise
     from sipe_bayes.posterior import Posterior
 
@@ -77,15 +77,16 @@ def suggest(
         ranked = suggestions.rank(*model, plans, noise, known, parameter or (), reached=reached, draws=draws, seed=seed)
         _write(problem, ranked[0].plan, out)
     if as_json:
-        print(to_json({**suggestions.to_dict(ranked, problem.simulator, parameter or ()), "out": str(out)}))
+        names = list(parameter or problem.simulator.space.names)
+        print(to_json({"parameters": names, "candidates": [one.to_dict() for one in ranked], "out": str(out)}))
         return
     environment, space = problem.environment, problem.simulator.space
     units = dict(zip(environment.channels, environment.channel_units, strict=True))
     for one in ranked[:_SHOWN]:
-        each = ", ".join(f"{name} {one.contraction[space.index(name)]:.2f}" for name in parameter or space.names)
-        reach = ", ".join(f"{c} {a:.3g} to {b:.3g} {units[c]}" for c, (a, b) in zip(units, one.reach, strict=True))
+        each = ", ".join(f"{name} {one.contraction[name]:.2f}" for name in parameter or space.names)
+        reach = ", ".join(f"{c} {a:.3g} to {b:.3g} {units[c]}" for c, (a, b) in one.reach.items())
         lost = f"; diverges at {one.diverged} of {draws} draws" if one.diverged else ""
-        far = f"; far beyond the logs in {listed([list(units)[c] for c in one.strays])}" if one.strays else ""
+        far = f"; far beyond the logs in {listed(one.strays)}" if one.strays else ""
         print(f"{one.score:.3f}  {one.plan.name}: expected contraction {each}; reaches {reach}{far}{lost}")
     if ranked[0].strays:
         print(
@@ -143,7 +144,7 @@ def _read(problem: Problem, file: Path, dt: float) -> Plan:
     """Commands of a table, in the configuration's columns and units, on the logs' grid."""
     from sipe_bayes.calibration.readers.tables import read_table
     from sipe_bayes.core.units import to_si
-    from sipe_bayes.diagnostics.expected import Plan
+    from sipe_bayes.diagnostics.suggest import Plan
 
     clock, commands, model = problem.config.columns.time, problem.config.commands, problem.simulator.model
     table, names = read_table(file), [clock.column, *(c.column for c in commands)]

@@ -106,12 +106,11 @@ ADVICE: dict[Code, str] = {
     ),
     Code.STARTS_AT_REST: (
         "Without a pose a window of a free body starts anywhere but where the body was. Measure it, or take the "
-        "likelihood that infers states."
+        "likelihood that infers states: then only the errors on held-out logs suffer."
     ),
     Code.CHAIN_NOT_FOLLOWED: (
         "Beyond a dead centre what is measured tells two places of the mechanism. Measure the joint that goes round."
     ),
-    Code.HELD_OUT_AT_REST: "Only the errors on held-out logs suffer. Measure the pose there too.",
     Code.IMPACTS: "With `state_space` every sample is a segment of its own, and process noise is estimated.",
     Code.BEYOND_START_NOISE: (
         "Raise `budget`, with another `--out`: the search then begins from more places. Shorter segments have fewer "
@@ -147,23 +146,16 @@ ADVICE: dict[Code, str] = {
         "While a finding blocks, nothing follows from it: what the fit lacks may stand in its place. Else there is "
         "nothing to do: the model does without it, and the interval is one-sided."
     ),
-    Code.RIDGE: "Only the combination acts on the motion. Use it, not its members.",
-    Code.RIDGE_TO_RESOLVE: "Weigh, measure or look up one member, and take it out of the unknowns.",
-    Code.WORTH_MEASURING: (
-        "Weigh or measure it by other means, write its value into the model and take it out of the unknowns: it is the "
-        "one on which most of the others hang. The more exactly it is known, the more exactly they are."
+    Code.RIDGE: (
+        "Only the combination acts on the motion. Use it; or weigh, measure or look up one member, and take it out of "
+        "the unknowns."
     ),
-    Code.RIDGE_EXPECTED: "The planned motion would tell the combination alone. Plan another, or fix a member.",
-    Code.NEVER_EXCITED: "The planned motion does not touch it.",
-    Code.NOT_DETERMINED_EXPECTED: "Send more, longer or faster motion of what it acts on.",
     Code.UNEVEN_TARGETS: (
         "One value for targets that differ in the model. Use `factor` in place of `bounds` where they should keep "
         "their proportions."
     ),
-    Code.NO_MISFIT: "Nothing to do. The cause that is named is the one that would have been looked at first.",
     Code.SMALL_MISFIT: "The values may be used. For a better prediction put the cause into the model.",
-    Code.MISFIT: _REMEDY_LACKING,
-    Code.MISFIT_SHIFTS: (f"{_REMEDY_LACKING} Until then read the values as those of a model that is wrong."),
+    Code.MISFIT: (f"{_REMEDY_LACKING} Until then read the values as those of a model that is wrong."),
     Code.BEHIND_PLAIN: "Initial states or noise explain what parameters should. Run `sipe discover`.",
     Code.LEAST_SQUARES: "Run `sipe discover`: it looks for the physics that the model lacks.",
     Code.NOISE_DRIFTS: (
@@ -181,27 +173,22 @@ ADVICE: dict[Code, str] = {
         "shorter ones into the model (`<option timestep>`), or use the values in a simulation that takes the same."
     ),
     Code.COLUMN_NOT_FOLLOWED: "Look whether the fit follows it; else at its zero, unit and sign.",
-    Code.CHECKS_THINNED: "Nothing to do; `sipe discover` looks at all of them.",
     Code.RESIDUALS_LEFT_OUT: "Look at the size of the process noise in place of the residuals.",
     Code.PROCESS_NOISE: (
-        "What the model lacks acts there. A few per cent are usual of a good model. Where steps stand out, look at the "
-        "log at these times: a kick, a contact, a sample that was lost."
+        "What the model lacks acts there. A few per cent are usual of a good model; of more add what you suspect as "
+        "parameters, or measure with less noise. Where steps stand out, look at the log at these times: a kick, a "
+        "contact, a sample that was lost."
     ),
-    Code.PROCESS_NOISE_LARGE: "Add what you suspect as parameters, or measure with less noise.",
-    Code.WITHIN_PRIOR: "Nothing to do.",
     Code.OUTSIDE_PRIOR: (
         "No values within the bounds simulate such a log. First suspects: unit or sign of that channel, a delay, a "
-        "model that was given wrong masses. Then the bounds."
-    ),
-    Code.OUTSIDE_PRIOR_FOLLOWED: (
-        "Units and signs are right, since the simulation bends as the log does. One of twenty right logs is called so. "
-        "Else widen the bounds that a value lies at, or let `sipe discover` look for the physics that the model lacks."
+        "model that was given wrong masses. Then the bounds. Where the calibrated model follows the log, units and "
+        "signs are right, and one of twenty right logs is called so: widen the bounds that a value lies at, or run "
+        "`sipe discover`."
     ),
     Code.LOGS_DISAGREE: (
         "Did something change between the logs: load, temperature, a zero, a battery, a screw? Then `per_log = "
         "true`. If not, the model lacks what the logs show differently: `sipe discover`."
     ),
-    Code.LOGS_DISAGREE_UNEXPLAINED: _REMEDY_LACKING,
     Code.HELD_OUT_DIVERGES: (
         "The calibrated model explodes on a motion that it was not fitted on: look at parameters at a bound, train "
         "on such motion too."
@@ -214,8 +201,7 @@ ADVICE: dict[Code, str] = {
         "The calibration did not help there. It fits what is peculiar to the training logs, or the model lacks "
         "what matters on this one."
     ),
-    Code.LOG_CLOCK: "Nothing to do.",
-    Code.LOG_RESAMPLED: "Nothing to do, unless the jitter is as large as the delays that you look for.",
+    Code.LOG_CLOCK: "Nothing to do, unless the jitter is as large as the delays that you look for.",
     Code.LOG_GAP: "Nothing to do where it is short, or rows are there. Else cut it out by `span` if commands changed.",
     Code.LOG_RATE: "Nothing to do.",
     Code.LOG_MISSING: "Nothing to do: masked samples are not fitted.",

@@ -41,11 +41,10 @@ def blocking(template: str, row: str = "") -> Text:
     return Text(Severity.BLOCKING, template, row)
 
 
-_LOOKS_LIKE = (
-    "{cause} ({percent:.3g} % of the residual of {channel}), most in {log} between {start:.3g} and {stop:.3g} s"
+_NOT_NOISE = (
+    "the residuals are not noise ({p}): they look like {cause} ({percent:.3g} % of the residual of {channel}), most in "
+    "{log} between {start:.3g} and {stop:.3g} s"
 )
-_NOT_NOISE = "the residuals are not noise ({p}): they look like " + _LOOKS_LIKE
-_RIDGE = "{combination} = {value:.4g} ± {width:.1g}{unit} "
 
 
 @unique
@@ -162,16 +161,12 @@ class Code(Enum):
         "(glitches, or what the model lacks)"
     )
     STARTS_AT_REST = blocking(
-        "the measurements do not tell the whole pose of joint {joint}: every window starts the rest of it where the "
-        "model has it; measure {needed}, or use likelihood = 'state_space'"
+        "the measurements do not tell the whole pose of joint {joint}: {where} the rest of it where the model has it; "
+        "measure {needed}{instead}"
     )
     CHAIN_NOT_FOLLOWED = blocking(
         "joint {joint} of a closed chain does not follow from what is measured all along: the mechanism passes a dead "
         "centre, or its loop does not close; measure joint:{joint}.position"
-    )
-    HELD_OUT_AT_REST = caution(
-        "the measurements do not tell the whole pose of joint {joint}: simulations of held-out logs start the rest of "
-        "it where the model has it; measure {needed} to believe their errors"
     )
     IMPACTS = blocking(
         "Bodies strike or slip within the segments of these logs, so the likelihood of segments has many optima. "
@@ -211,26 +206,20 @@ class Code(Enum):
         "the upper end of its interval",
         "none shows",
     )
-    RIDGE = note(_RIDGE + "is determined; {alone} not")
-    RIDGE_TO_RESOLVE = caution("{ridge}: fix one of them at a measured value")
-    WORTH_MEASURING = caution("a measured value of {parameters} would determine {count} more: {others}")
-    RIDGE_EXPECTED = caution(_RIDGE + "would be determined; {alone} not")
-    NEVER_EXCITED = caution("{parameters} is never excited: its posterior will be what is known now")
-    NOT_DETERMINED_EXPECTED = caution("{parameters} would not be determined (expected contraction {contraction:.2f})")
+    RIDGE = caution(
+        "{combination} = {value:.4g} ± {width:.1g}{unit} is determined; {alone} not: fix one of them at a measured "
+        "value"
+    )
     UNEVEN_TARGETS = caution(
         "{parameters}: its targets have different values in the model, so 'the model as given' stands for all at "
         "{default:.4g} {unit}"
     )
 
     # what the model lacks
-    NO_MISFIT = note("the residuals pass for noise ({p}); what they resemble most is " + _LOOKS_LIKE)
     SMALL_MISFIT = caution(
         _NOT_NOISE + "; a small effect that moves no parameter by more than {far:g} sd: {remedy} if you need more"
     )
-    MISFIT = caution(_NOT_NOISE + "; do not trust the intervals' width: {remedy}", "model lacks something")
-    MISFIT_SHIFTS = caution(
-        _NOT_NOISE + "; with {which} in the model the estimate would move, {moved}: {remedy}", "model lacks something"
-    )
+    MISFIT = caution(_NOT_NOISE + "; {effect}: {remedy}", "model lacks something")
     BEHIND_PLAIN = caution(
         "Free simulations of the training logs miss by {error:.2g} % of the motion with the estimates, and by "
         "{plain:.2g} % with plain least squares"
@@ -249,7 +238,6 @@ class Code(Enum):
         "noise: what is left is rounding, and says nothing of the model; the intervals are those of rounding too"
     )
     UNTOLD = note("{moved}")
-    CHECKS_THINNED = note("what the model lacks was computed from {asked} of the fit's {windows} segments")
     RESIDUALS_LEFT_OUT = note(
         "Residuals, and whether they are noise: with likelihood = 'state_space' the state is unknown at every sample, "
         "and process noise, which is inferred, takes what the model lacks. Errors and signals are over windows from "
@@ -257,37 +245,18 @@ class Code(Enum):
     )
     PROCESS_NOISE = note(
         "Process noise is largest in the {coordinate}: its sd is {sd:.2g}, {percent} % of how far that moves in a "
-        "control step. Steps that stand out and count for little: {count} of {steps}{times}."
-    )
-    PROCESS_NOISE_LARGE = caution(
-        "A model that lacks nothing needs next to no process noise. Either this one lacks something there, or "
-        "measurement noise hides how stiff the contact is: then estimates may be off by several posterior sds"
+        "control step. Steps that stand out and count for little: {count} of {steps}{times}.{meaning}"
     )
 
     # logs
-    WITHIN_PRIOR = note("log {log} is like simulations of the prior ({p})")
     OUTSIDE_PRIOR = blocking(
-        "log {log} is unlike simulations of the prior ({p}), most in {channel} at {time:.3g} s: widen the "
-        "bounds, or correct the model, units or signs"
-    )
-    OUTSIDE_PRIOR_FOLLOWED = caution(
-        "log {log} is unlike simulations of the prior ({p}), most in {channel} at {time:.3g} s; the calibrated "
-        "model follows it all the same"
+        "log {log} is unlike simulations of the prior ({p}), most in {channel} at {time:.3g} s; {remedy}"
     )
     COLUMN_NOT_FOLLOWED = note(
         "before the fit, the model explains little of the forces that move {channel!r}: {times:.2g} times their change "
         "is left; look at its zero, unit and sign, which sipe init tries, and at what the model lacks"
     )
-    LOGS_DISAGREE = blocking(
-        "the logs disagree about {parameters} (p = {p:.1g}): the others being common, {estimates}; "
-        "give it per_log = true, model what changed, or leave a log out{without}",
-        "disagrees between logs",
-    )
-    LOGS_DISAGREE_UNEXPLAINED = blocking(
-        "the logs disagree (p = {p:.1g}) and no single parameter explains it: the model lacks something that shows "
-        "differently in them; {most}{without}",
-        "disagrees between logs",
-    )
+    LOGS_DISAGREE = blocking("the logs disagree{about} (p = {p:.1g}): {why}{without}", "disagrees between logs")
     TRAIN_WORSE = blocking(
         "on the very logs that it was fitted to the calibrated model is worse than the model as given (its error is "
         "{ratio:.3g} times larger): the search ended in a wrong place; set search.start, narrow the bounds or shorten "
@@ -297,8 +266,7 @@ class Code(Enum):
     HELD_OUT_WORSE = caution(
         "held-out {log}, {channel}: {rmse:.3g} {unit} is not better than the model as given ({rmse_default:.3g})"
     )
-    LOG_CLOCK = note("{samples} samples passed through unchanged at {rate}; clock jitter up to {jitter_ms:.3g} ms")
-    LOG_RESAMPLED = note("{samples} samples at {own_rate}, clock jitter up to {jitter_ms:.3g} ms, resampled to {rate}")
+    LOG_CLOCK = note("{samples} samples at {own_rate}, clock jitter up to {jitter_ms:.3g} ms, {done}")
     LOG_GAP = note("no measurement from {start:.3f} to {stop:.3f} s; where rows are missing, commands are held")
     LOG_RATE = note("{channel} comes at {rate}, in one of {every} samples; between them it is not fitted")
     LOG_MISSING = note("{channel}: {missing} of {samples} samples missing, masked")

@@ -38,7 +38,6 @@ __all__ = [
 S = TypeVar("S")
 T = TypeVar("T")
 _ONE = re.compile(r"(?<![\w.,])1 (column|draw|group|log|sample|simulation|step|structure|window)s\b")
-_LACKS = (Code.MISFIT, Code.MISFIT_SHIFTS)
 _UNFINISHED = (
     Code.BUDGET_SPENT,
     Code.TIME_LIMIT,
@@ -54,7 +53,7 @@ def rank(code: Code, severity: Severity) -> int:
     if severity is Severity.BLOCKING:
         return 2 if code in _UNFINISHED else 0
     if severity is Severity.CAUTION:
-        return 1 if code in _LACKS else 3
+        return 1 if code is Code.MISFIT else 3
     return 4
 
 

@@ -41,9 +41,6 @@ class Thresholds(Options):
         "a parameter that moves no channel by more changes nothing: ten times what rounding of a rollout does",
         "of the signal's spread",
     )
-    sensitivity: float = option(
-        1e-3, "a change of the value by a tenth that moves observations less moves nothing", "of their spread"
-    )
 
     # several parameters
     ridge: float = option(

@@ -1,40 +1,25 @@
 """Is an estimator calibrated? Many truths drawn from the prior, a posterior for each.
 
-Three transforms of (posterior, truth) are uniform on [0, 1] when the posteriors are right, and each is compared with
-uniform in one way.
+Three transforms of (posterior, truth) are uniform on [0, 1] when the posteriors are right; each is compared with
+uniform by the test of Kolmogorov and Smirnov, with its simultaneous band.
 
 - Ranks u_j = P(theta_j < theta*_j), by parameter: simulation-based calibration (S. Talts, M. Betancourt, D. Simpson,
   A. Vehtari, A. Gelman 2018, https://arxiv.org/abs/1804.06788). They see shift and width.
 - abs(2 u_j - 1): the level of the smallest central interval that holds the truth. The share of these at or below a
   level is the coverage of that level. They see width.
 - TARP: the posterior's mass nearer to a random reference point than the truth is (P. Lemos, A. Coogan, Y. Hezaveh, L.
-  Perreault-Levasseur 2023, "Sampling-Based Accuracy Testing of Posterior Estimators for General Inference",
-  https://arxiv.org/abs/2302.03026). It sees the parameters jointly: correlations, and nested boxes that the others
-  miss.
+  Perreault-Levasseur 2023, https://arxiv.org/abs/2302.03026). It sees the parameters jointly.
 
-Compared with uniform by the largest deviation of the empirical distribution, on 99 levels, in terms of the binomial
-tail probability there, calibrated by simulation; its simultaneous band is that of T. Sailynoja, P.-C. Burkner, A.
-Vehtari 2022, "Graphical test for discrete uniformity", https://arxiv.org/abs/2103.10522.
+Masses are those of draws, a tie or a gap between draws broken at random, which makes them exactly uniform for a right
+posterior; ``sbi.diagnostics`` breaks no ties, so that particles of unequal weights and points pile up, and compares
+TARP's bins as if they were independent draws. TARP's references are uniform in the cube.
 
-sbi has these checks too (``sbi.diagnostics``) and is not called, because it would lose what is said here. Its
-``run_sbc`` and ``run_tarp`` draw from sbi's own posteriors and x; under them, ranks are counts without ties broken, so
-that particles of unequal weights and points pile up, and TARP is a histogram between the smallest and the largest
-credibility, whose ``check_tarp`` compares two curves of bins by Kolmogorov-Smirnov as if bins were independent draws:
-its p-value does not depend on the number of truths. On the same draws ours are theirs (tested): the counts of ranks
-exactly, TARP's curve up to its bins.
-
-Deviations:
-
-- Masses are those of ``draws`` draws, a tie or a gap between draws broken at random, which makes them exactly uniform
-  for a right posterior.
-- TARP's references are uniform in the cube.
-- A method that returns the prior passes all three: look at contraction too. Draws of an ill-mixed chain fail though
-  their distribution be right.
+A method that returns the prior passes all three: look at contraction too. Draws of an ill-mixed chain fail though their
+distribution be right.
 """
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -43,28 +28,24 @@ import numpy as np
 import scipy.stats
 import torch
 from numpy.typing import ArrayLike
+from scipy.special import betaln
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.posterior import Posterior
 
 Verdict = Literal["calibrated", "too narrow", "too wide", "shifted"]
 
 LEVELS = np.arange(1, 100) / 100
-_SIMULATED = 4000  # samples of the null: p resolves a quarter of a thousandth
 FEWEST = 20  # pairs: fewer show nothing at the level of the check
 
 
 @dataclass(frozen=True)
 class Uniformity:
-    """Values that should be uniform, compared with that.
+    """Values (R,) that should be uniform; p: the probability of a larger deviation.
 
-    Args:
-        values: (R,).
-        curve: (L,) the share at or below each of ``LEVELS``.
-        low: (L,) of the band that holds the whole curve of uniform values in all but one per cent of cases.
-        high: (L,) of the same band.
-        p: the probability of a larger deviation.
+    ``curve`` (L,) is the share at or below each of ``LEVELS``; the band from ``low`` to ``high`` (L,) holds the whole
+    curve of uniform values in all but one per cent of cases.
     """
 
     values: FloatArray
@@ -76,13 +57,9 @@ class Uniformity:
 
 @dataclass(frozen=True)
 class CalibrationCheck:
-    """What R pairs (posterior, truth) say.
+    """What R pairs (posterior, truth) say: of each of N parameters, and by TARP of all together.
 
-    Args:
-        names: of the N parameters.
-        ranks: of each parameter.
-        intervals: of each parameter, the levels of the intervals that hold the truth.
-        tarp: of all together.
+    ``intervals`` are the levels of the intervals that hold the truth.
     """
 
     names: tuple[str, ...]
@@ -94,11 +71,6 @@ class CalibrationCheck:
     def truths(self) -> int:
         """R."""
         return len(self.tarp.values)
-
-    @property
-    def p_values(self) -> tuple[float, ...]:
-        """Of the ranks, by parameter."""
-        return tuple(u.p for u in self.ranks)
 
     def coverage(self, level: float) -> FloatArray:
         """The share (N,) of central intervals of ``level`` that hold the truth."""
@@ -120,43 +92,34 @@ class CalibrationCheck:
             return "shifted"
         return "too narrow" if out > 0 else "too wide"
 
-    def sentences(self) -> list[str]:
-        """One for the ranks, one for the coverage, one for TARP; each names what is wrong and by how much."""
-        return [self._ranks_sentence(), self._coverage_sentence(), self._tarp_sentence()]
-
     @property
     def calibrated(self) -> bool:
         """Whether no check gives cause for alarm."""
         each = all(self.verdict(name) == "calibrated" for name in self.names)
         return each and self.tarp.p >= THRESHOLDS.miscalibrated
 
-    def _ranks_sentence(self) -> str:
-        wrong = [(name, u) for name, u in zip(self.names, self.ranks, strict=True) if u.p < self._alarm]
-        if not wrong:
-            return f"ranks: uniform for all parameters (smallest p = {min(self.p_values):.2g}, {self.truths} truths)"
-        name, worst = min(wrong, key=lambda pair: pair[1].p)
-        above = float(np.mean(worst.values > 0.5))
-        also = f", and for {len(wrong) - 1} more" if len(wrong) > 1 else ""
-        return (
-            f"ranks: not uniform for {name} (p = {worst.p:.1g}){also}: the truth lies above the median "
-            f"{_percent(above)} of the time, {_tails(worst)}"
-        )
-
-    def _coverage_sentence(self) -> str:
+    def sentences(self) -> list[str]:
+        """One for the ranks, one for the coverage, one for TARP; each names what is wrong and by how much."""
         level = THRESHOLDS.shown_interval
-        held = f"{_percent(level)} intervals hold the truth {_percent(self.coverage(level).mean())} of the time"
-        wrong = [(name, u) for name, u in zip(self.names, self.intervals, strict=True) if u.p < self._alarm]
-        if not wrong:
-            return f"coverage: {held}: as they should (smallest p = {min(u.p for u in self.intervals):.2g})"
-        name, worst = min(wrong, key=lambda pair: (pair[1].p, -abs(_lean(pair[1]))))
-        share = float(np.mean(worst.values <= level))
-        return f"coverage: {held}: {self.verdict(name)}, worst {name} with {_percent(share)} (p = {worst.p:.1g})"
-
-    def _tarp_sentence(self) -> str:
-        if self.tarp.p >= THRESHOLDS.miscalibrated:
-            return f"TARP: regions about random points hold the truth as often as they should (p = {self.tarp.p:.2g})"
-        wrong = f"do not hold the truth as often as they say (p = {self.tarp.p:.1g}), {_tails(self.tarp)}"
-        return f"TARP: regions about random points {wrong}"
+        least = min(u.p for u in self.ranks)
+        ranks = f"ranks: uniform for all parameters (smallest p = {least:.2g}, {self.truths} truths)"
+        if wrong := [pair for pair in zip(self.names, self.ranks, strict=True) if pair[1].p < self._alarm]:
+            name, worst = min(wrong, key=lambda pair: pair[1].p)
+            also = f", and for {len(wrong) - 1} more" if len(wrong) > 1 else ""
+            ranks = (
+                f"ranks: not uniform for {name} (p = {worst.p:.1g}){also}: the truth lies above the median "
+                f"{np.mean(worst.values > 0.5):.0%} of the time"
+            )
+        held = f"{level:.0%} intervals hold the truth {self.coverage(level).mean():.0%} of the time"
+        coverage = f"coverage: {held}: as they should (smallest p = {min(u.p for u in self.intervals):.2g})"
+        if wrong := [pair for pair in zip(self.names, self.intervals, strict=True) if pair[1].p < self._alarm]:
+            name, worst = min(wrong, key=lambda pair: (pair[1].p, -abs(_lean(pair[1]))))
+            share = np.mean(worst.values <= level)
+            coverage = f"coverage: {held}: {self.verdict(name)}, worst {name} with {share:.0%} (p = {worst.p:.1g})"
+        tarp = f"hold the truth as often as they should (p = {self.tarp.p:.2g})"
+        if self.tarp.p < THRESHOLDS.miscalibrated:
+            tarp = f"do not hold the truth as often as they say (p = {self.tarp.p:.1g})"
+        return [ranks, coverage, f"TARP: regions about random points {tarp}"]
 
     def to_dict(self) -> dict[str, object]:
         """Plain data, for JSON."""
@@ -182,13 +145,7 @@ class CalibrationCheck:
 def check_calibration(
     posteriors: Sequence[Posterior], truths: ArrayLike, *, draws: int = 999, seed: int = 0
 ) -> CalibrationCheck:
-    """Check posteriors against their truths, drawn from the prior.
-
-    Args:
-        posteriors: R of them, of the same N parameters.
-        truths: (R, N) in theta.
-        draws: of each posterior.
-        seed: the same one gives the same answer.
+    """Check R posteriors of the same N parameters, ``draws`` of each, against their truths (R, N) in theta.
 
     Raises:
         ValueError: for fewer than 20 pairs or other shapes.
@@ -220,6 +177,29 @@ def check_draws(
     )
 
 
+def clearly_wrong(ranks: FloatArray) -> bool:
+    """Whether ranks (R, N) of truths leave no doubt that posteriors are wrong: a test that may look after every log.
+
+    Under right posteriors the truth lies in a 90 % interval, and below the median, as independent coins of .9 and of a
+    half fall. Against such a coin of chance p the mixture of all others, e_n = B(k + 1/2, n - k + 1/2) / B(1/2, 1/2) /
+    (p^k (1 - p)^(n - k)) for k of n, ever reaches 1 / alpha with probability alpha at most (J. Ville 1939).
+    ``THRESHOLDS.miscalibrated`` is shared out among the 2 N coins of N parameters.
+    """
+    inside, below = np.abs(2 * ranks - 1) <= THRESHOLDS.shown_interval, ranks < 0.5
+    enough = np.log(2 * ranks.shape[1] / THRESHOLDS.miscalibrated)
+    return any(
+        max(_evidence(held, THRESHOLDS.shown_interval), _evidence(low, 0.5)) >= enough
+        for held, low in zip(inside.T, below.T, strict=True)
+    )
+
+
+def _evidence(outcomes: BoolArray, chance: float) -> float:
+    """Log e_n of outcomes (R,) against coins of a chance."""
+    n, k = len(outcomes), int(np.count_nonzero(outcomes))
+    mixture = betaln(k + 0.5, n - k + 0.5) - betaln(0.5, 0.5)
+    return float(mixture - k * np.log(chance) - (n - k) * np.log1p(-chance))
+
+
 def mass_below(draws: FloatArray, truth: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Mass (N,) below a truth (N,) of draws (M, N): uniform if the truth is one more draw; ``rng`` breaks ties."""
     below, equal = (draws < truth).sum(0), (draws == truth).sum(0)
@@ -229,17 +209,7 @@ def mass_below(draws: FloatArray, truth: FloatArray, rng: np.random.Generator) -
 def tarp_values(
     draws: Sequence[FloatArray], truths: FloatArray, references: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """TARP's credibilities: the mass of draws nearer to a reference than the truth is.
-
-    Args:
-        draws: R of (M, N).
-        truths: (R, N).
-        references: (R, N).
-        rng: breaks ties.
-
-    Returns:
-        (R,).
-    """
+    """TARP's credibilities (R,): the mass of R draws (M, N) nearer to references (R, N) than truths (R, N) are."""
     masses = [
         mass_below(np.linalg.norm(d - r, axis=1, keepdims=True), np.linalg.norm(t - r, axis=0, keepdims=True), rng)
         for d, t, r in zip(draws, truths, references, strict=True)
@@ -249,44 +219,12 @@ def tarp_values(
 
 def uniformity(values: FloatArray) -> Uniformity:
     """Compare values (R,) in [0, 1] with uniform."""
-    count = len(values)
-    below = np.searchsorted(np.sort(values), LEVELS, side="right")
-    tails, smallest = _null(count)
-    least = tails[np.arange(len(LEVELS)), below].min()
-    simulated = (1 + int((smallest <= least).sum())) / (1 + len(smallest))
-    p = min(simulated, 2 * len(LEVELS) * float(least))  # Bonferroni's bound reaches below what simulation resolves
-    inside = tails >= np.quantile(smallest, THRESHOLDS.miscalibrated)
-    low = inside.argmax(1) / count
-    high = (count - inside[:, ::-1].argmax(1)) / count
-    return Uniformity(values, below / count, low, high, p)
-
-
-@functools.lru_cache(maxsize=8)
-def _null(count: int) -> tuple[FloatArray, FloatArray]:
-    """Binomial tail probabilities (L, count + 1), the smaller side, of so many values at or below each level.
-
-    With them their least over the levels in simulations of uniform values.
-    """
-    k = np.arange(count + 1)
-    level = LEVELS[:, None]
-    tails = np.minimum(scipy.stats.binom.cdf(k, count, level), scipy.stats.binom.sf(k - 1, count, level))
-    rng = np.random.default_rng(count)
-    smallest = np.empty(_SIMULATED)
-    for i in range(_SIMULATED):
-        below = np.searchsorted(np.sort(rng.random(count)), LEVELS, side="right")
-        smallest[i] = tails[np.arange(len(LEVELS)), below].min()
-    return tails, smallest
+    curve = np.searchsorted(np.sort(values), LEVELS, side="right") / len(values)
+    margin = float(scipy.stats.kstwo.isf(THRESHOLDS.miscalibrated, len(values)))
+    low, high = np.clip(LEVELS - margin, 0, 1), np.clip(LEVELS + margin, 0, 1)
+    return Uniformity(values, curve, low, high, float(scipy.stats.kstest(values, "uniform").pvalue))
 
 
 def _lean(seen: Uniformity) -> float:
     """By how many standard errors the mean of the values is above 1/2."""
     return float((seen.values.mean() - 0.5) * np.sqrt(12 * len(seen.values)))
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %"
-
-
-def _tails(seen: Uniformity) -> str:
-    outer = float(np.mean(np.abs(seen.values - 0.5) > 0.45))
-    return f"and {_percent(outer)} instead of 10 % of the values are in the outer tenth"

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 from sipe_bayes.core.findings import Finding, Findings
-from sipe_bayes.diagnostics.records import ChannelNoise, Comparison, Misfit, Residual, Signal
+from sipe_bayes.diagnostics.records import ChannelNoise, Comparison, Misfit, Residual, Signal, plain
 from sipe_bayes.diagnostics.result import ParameterSummary
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.structure.structures import StructureRow
@@ -18,18 +18,13 @@ class Piece:
 
     Args:
         label: what tells it from others, as the table of structures has it.
-        sentence: what it is.
-        reference: where it is described.
         weight: sum of the stacking weights of the structures that have it.
         gain: nats of log predictive density that it adds to the rest of the best structure that has it; None where the
-            rest was not fitted.
-        error: standard error of the gain.
+            rest was not fitted, as its standard ``error``.
         kept: whether the structure that is written out has it.
         tied: whether another structure of the set that the logs support has it.
         kind: what it is placed at: ``joint``, ``actuator``, ``channel`` (a measurement) or ``world``.
-        native: whether MJCF has an element for it.
-        nearest: the element that comes nearest where it has none.
-        parameters: names of its parameters.
+        native: whether MJCF has an element for it, and the ``nearest`` element where it has none.
     """
 
     label: str
@@ -48,15 +43,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class Promise:
-    """What an extension promised at the plain model.
-
-    Args:
-        label: of the extension.
-        sentence: what it is.
-        gain: log-likelihood that it is to gain, in nats.
-        fitted: whether it was fitted.
-        unfinished: whether a fit with it, alone or beside others, could not be brought to its end.
-    """
+    """What an extension promised at the plain model: nats of log likelihood; ``unfinished``: a fit with it failed."""
 
     label: str
     sentence: str
@@ -67,18 +54,10 @@ class Promise:
 
 @dataclass(frozen=True)
 class ModelErrors:
-    """Root-mean-square errors of one channel of one log over open-loop windows.
+    """RMSE of one channel of one log in its unit: of the nominal model, before and after.
 
-    Args:
-        log: its name.
-        use: ``train`` or ``holdout``.
-        channel: its name.
-        unit: of the errors.
-        given: of the model as given, from measured starts.
-        before: of the plain model, calibrated, from measured starts.
-        after: of the structure that is written out, from measured starts.
-        fitted_before: of the plain model, calibrated, from the starts that fit it best.
-        fitted_after: of the structure that is written out, from the starts that fit it best.
+    ``before`` is the plain model, calibrated, ``after`` the structure that is written out, both from measured starts;
+    ``fitted_before`` and ``fitted_after`` are theirs from the starts that each fits best.
     """
 
     log: str
@@ -94,13 +73,7 @@ class ModelErrors:
 
 @dataclass(frozen=True)
 class Stage:
-    """What a model leaves of the training logs.
-
-    Args:
-        noise: of each channel.
-        misfit: whether the residuals pass for noise; None where that cannot be told.
-        residuals: of each log and channel.
-    """
+    """What a model leaves of the training logs; ``misfit`` is None where it cannot be told."""
 
     noise: Mapping[str, ChannelNoise]
     misfit: Misfit | None
@@ -112,29 +85,21 @@ class Discovery:
     """The outcome of ``sipe discover``.
 
     Args:
-        name: of the run.
         rows: structures that were fitted, the set that the logs support first.
-        pieces: extensions that were fitted, those of the structure that is written out first.
+        pieces: extensions that were fitted, those that are written out first.
         promises: what extensions promised at the plain model, best first.
-        posterior: of the user's parameters, stacked over the set that the logs support.
-        prior: of them.
-        parameters: that posterior by parameter.
+        posterior: of the user's parameters, stacked over the set that the logs support; ``parameters`` sums it up.
         plain_parameters: the posterior under the plain model.
         added: parameters of the written structure's extensions, stacked over the structures that have them.
         best: the optimum of the structure that is written out, in units.
         errors: before and after, held-out logs first.
         comparison: of the held-out errors after with those before, from the starts that each model fits best; None
             without both.
-        before: what the plain model leaves.
-        after: what the structure that is written out leaves.
+        before, after: what the plain model leaves, and what the structure that is written out leaves.
         signals: of each log and channel; ``mode`` is the structure, ``default`` the plain model, calibrated.
-        settled: whether every fit that counts came to rest, and the budget was enough.
+        settled: whether every fit that counts converged, and the budget was enough.
         rollouts: of all fits.
-        seconds: that it took.
-        findings: what was noticed on the way.
-        run: record of the run.
-        out: folder of the results.
-        best_settled: whether the fit of the structure that is written out came to rest.
+        best_settled: whether the fit of the structure that is written out converged.
         ended: what cut the search short: its "budget", its "time", or that it was "interrupted"; else nothing.
     """
 
@@ -174,28 +139,12 @@ class Discovery:
 
     def to_dict(self) -> dict[str, object]:
         """As JSON has it, without signals and residuals."""
+        names = ("name", "pieces", "promises", "parameters", "plain_parameters", "added", "best", "errors")
+        more = ("comparison", "settled", "best_settled", "findings", "rollouts", "seconds", "out")
+        stages = {"before": self.before, "after": self.after}
         return {
-            "name": self.name,
-            "structures": [asdict(row) for row in self.rows],
-            "pieces": [asdict(piece) for piece in self.pieces],
-            "promises": [asdict(promise) for promise in self.promises],
-            "parameters": [asdict(p) for p in self.parameters],
-            "plain_parameters": [asdict(p) for p in self.plain_parameters],
-            "added": [asdict(p) for p in self.added],
-            "best": dict(self.best),
-            "errors": [asdict(row) for row in self.errors],
-            "comparison": None if self.comparison is None else self.comparison.to_dict(),
-            **{name: _stage(stage) for name, stage in (("before", self.before), ("after", self.after))},
-            "settled": self.settled,
-            "best_settled": self.best_settled,
-            "findings": [item.to_dict() for item in self.findings],
+            **{name: plain(getattr(self, name)) for name in (*names, *more)},
+            **{name: plain({"noise": one.noise, "misfit": one.misfit}) for name, one in stages.items()},
+            "structures": plain(self.rows),
             "warnings": Findings(self.findings).warnings,
-            "rollouts": self.rollouts,
-            "seconds": self.seconds,
-            "out": self.out,
         }
-
-
-def _stage(stage: Stage) -> dict[str, object]:
-    misfit = None if stage.misfit is None else {**asdict(stage.misfit), "alarm": stage.misfit.alarm}
-    return {"noise": {channel: asdict(noise) for channel, noise in stage.noise.items()}, "misfit": misfit}

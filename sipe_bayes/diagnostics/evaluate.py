@@ -8,27 +8,19 @@ second tells the start: a slope of noisy poses is so far off that its error woul
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import replace
 
 import numpy as np
 import scipy.stats
-import torch
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, Residual, Signal
 from sipe_bayes.envs.poses import inertial_joints
 from sipe_bayes.likelihood import BoundLikelihood, Noise
-from sipe_bayes.posterior import Posterior
 from sipe_bayes.simulation.simulator import Simulator
 
-_BAND_DRAWS = 64  # of the posterior, whose 5 % and 95 % are drawn
-_NARROW, _FEW_DRAWS = 0.05, 16  # sd of the cube to which the band is to first order; of wider ones so many draws
-_FIRST, _FEWEST = 0.1, 8  # s, and control steps at least: few bodies strike so soon, and six unknowns want as many
 LOOKED_AT = 2000  # control steps that say whether measured starts make most of an error
-_AT_LIMIT = 1e-3  # relative: so near to it a correlation time is the longest that may be
-_PIECES = 10  # of a log: errors of neighbouring samples are not independent, of tenths nearly so
 
 
 def errors(windows: BoundLikelihood, theta: FloatArray) -> FloatArray:
@@ -36,12 +28,12 @@ def errors(windows: BoundLikelihood, theta: FloatArray) -> FloatArray:
 
     Infinite where one of the log's windows diverges, NaN where a channel has no sample.
     """
-    return _roots(windows, _squares(windows, theta))
+    return _roots(windows, _squares(windows, windows.predict(theta, measured_starts(windows, theta))[0]))
 
 
 def errors_from_best_starts(windows: BoundLikelihood, theta: FloatArray) -> FloatArray:
     """As ``errors`` of one theta (N,), from the starts that it fits best: (logs, C)."""
-    return np.asarray(_roots(windows, _best_squares(windows, theta)[None])[0])
+    return np.asarray(_roots(windows, _best_residuals(windows, theta)[None] ** 2)[0])
 
 
 def _roots(windows: BoundLikelihood, square: FloatArray) -> FloatArray:
@@ -56,12 +48,7 @@ def _roots(windows: BoundLikelihood, square: FloatArray) -> FloatArray:
     return out
 
 
-def _squares(windows: BoundLikelihood, theta: FloatArray) -> FloatArray:
-    """Squared errors (B, W, L, C) of theta (B, N) from measured starts, zero where nothing was measured."""
-    return _off(windows, windows.predict(theta, measured_starts(windows, theta))[0])
-
-
-def _off(windows: BoundLikelihood, predicted: FloatArray) -> FloatArray:
+def _squares(windows: BoundLikelihood, predicted: FloatArray) -> FloatArray:
     """Squared errors (B, W, L, C) of predictions, zero where nothing was measured."""
     return np.where(windows.observed, (windows.measured - predicted) ** 2, 0.0)
 
@@ -77,45 +64,36 @@ def compare_errors(
     theta: FloatArray,
     reference: tuple[BoundLikelihood, FloatArray] | None = None,
     fit_starts: bool = False,
-    predicted: FloatArray | None = None,
 ) -> Comparison | None:
-    """Errors of theta against those of a reference, the model as given if nothing else is named.
+    """Errors of theta (N,) against those of a reference, the nominal model if nothing else is named.
 
     The mean over logs and channels of log(RMSE of the reference / RMSE of theta), with the jackknife's standard error
-    over tenths of each log, which takes the errors of both models and all channels out together (a paired t-test on
-    pieces of time). It speaks of these logs, not of others that the machine might give; in a log of few windows the
-    pieces of one share its start, and p is too small.
+    over tenths of each log (a paired t-test on pieces of time). It speaks of these logs, not of others that the machine
+    might give; in a log of few windows the pieces of one share its start, and p is too small.
 
     Where measured starts make nearly all of theta's error (velocities from noisy positions), both models are compared
-    from the starts that each fits best.
+    from the starts that each fits best. None where there is nothing finite to compare.
 
     Args:
         windows: the logs.
         theta: (N,).
         reference: the same windows of another simulator, and its theta (M,).
         fit_starts: whether both are compared from the starts that each fits best in any case.
-        predicted: what ``both_predicted`` gave, where there is no other reference.
-
-    Returns:
-        None where there is nothing finite to compare.
     """
-    others, at = reference or (windows, np.clip(windows.simulator.space.default_theta, 0, 1))
-    if predicted is None:
-        square = np.concatenate([_squares(windows, theta[None]), _squares(others, at[None])])
-    else:
-        square = _off(windows, predicted)
-    some = windows.spread_over(LOOKED_AT, every_log=True)
-    share = _share_of_starts(windows, square[0][some], _best_squares(windows.part(some), theta))
+    models = (windows, theta), reference or (windows, np.clip(windows.simulator.space.default_theta, 0, 1))
+    measured = [_squares(w, w.predict(x[None], measured_starts(w, x[None]))[0]) for w, x in models]
+    square, some = np.concatenate(measured), windows.spread_over(LOOKED_AT, every_log=True)
+    share = _share_of_starts(windows, square[0][some], _best_residuals(windows.part(some), theta) ** 2)
     by_starts = share > THRESHOLDS.starts_rule
     if by_starts or fit_starts:
-        fits = np.stack([_best_squares(windows, theta), _best_squares(others, at)])
+        fits = np.stack([_best_residuals(w, x) for w, x in models]) ** 2
         by_starts &= bool(np.isfinite(fits).all())
         square = fits if np.isfinite(fits).all() else square
     parts = []  # of each log: sums (2, pieces, C)
     for k in range(len(windows.trajectories)):
         mine = windows.log == k
         rows, owned = square[:, mine].reshape(2, -1, square.shape[-1]), windows.compared[mine].any(-1).ravel()
-        pieces = np.array_split(rows[:, owned], _PIECES, axis=1)
+        pieces = np.array_split(rows[:, owned], 10, axis=1)
         sums = np.stack([piece.sum(1) for piece in pieces], axis=1)
         usable = np.isfinite(sums).all((0, 1)) & (np.count_nonzero(sums, axis=1) > 1).all(0)
         if usable.any():
@@ -125,28 +103,19 @@ def compare_errors(
     return replace(_jackknifed(parts), starts=share if by_starts else None)
 
 
-def _best_squares(windows: BoundLikelihood, theta: FloatArray) -> FloatArray:
-    """As ``_squares`` of one theta (N,), from the starts that fit best: (W, L, C)."""
-    residual, valid = _best_residuals(windows, theta)
-    return np.where(windows.observed, residual**2 if valid else np.inf, 0.0)
-
-
-def _best_residuals(windows: BoundLikelihood, theta: FloatArray) -> tuple[FloatArray, bool]:
-    """Residuals (W, L, C) of theta (N,) from the starts that fit best, and whether the simulation is valid."""
+def _best_residuals(windows: BoundLikelihood, theta: FloatArray) -> FloatArray:
+    """Residuals (W, L, C) of theta (N,) from the starts that fit best; infinite where the simulation is not valid."""
     noise = Noise(np.maximum(0.05 * np.nan_to_num(windows.spread), windows.rounding), np.zeros(len(windows.fitted)))
-    return windows.fit_starts(theta, noise)[1:]
+    residual, valid = windows.fit_starts(theta, noise)[1:]
+    return np.where(windows.observed, residual if valid else np.inf, 0.0)
 
 
 def _share_of_starts(windows: BoundLikelihood, square: FloatArray, fitted: FloatArray) -> float:
-    """How much smaller squared errors (W, L, C) are from fitted starts; 0 where either is infinite.
-
-    They are in units of each channel's spread.
-    """
-    if not (np.isfinite(square).all() and np.isfinite(fitted).all()):
-        return 0.0
+    """How much smaller squared errors (W, L, C) are from fitted starts, in the spreads; 0 where either is infinite."""
     weight = np.where(windows.spread > 0, 1 / np.maximum(windows.spread, 1e-300) ** 2, 0.0)
-    before = float((square * weight).sum())
-    return 1 - float((fitted * weight).sum()) / before if before > 0 else 0.0
+    with np.errstate(invalid="ignore"):
+        before, after = float((square * weight).sum()), float((fitted * weight).sum())
+    return 1 - after / before if np.isfinite(before + after) and before > 0 else 0.0
 
 
 def _jackknifed(parts: list[FloatArray]) -> Comparison:
@@ -178,7 +147,7 @@ def fitted_units(windows: BoundLikelihood) -> list[str]:
 
 def channel_noise(windows: BoundLikelihood, noise: Noise) -> dict[str, ChannelNoise]:
     """The noise of each fitted channel."""
-    at_limit = noise.tau >= (1 - _AT_LIMIT) * windows.trajectories.longest
+    at_limit = noise.tau >= (1 - 1e-3) * windows.trajectories.longest
     rows = zip(noise.sd.tolist(), noise.tau.tolist(), fitted_units(windows), at_limit.tolist(), strict=True)
     return {channel: ChannelNoise(*row) for channel, row in zip(windows.fitted, rows, strict=True)}
 
@@ -188,7 +157,7 @@ def channel_scores(
 ) -> list[ChannelScore]:
     """One row for each log and channel, theta (N,) beside the model as given; predicted: by ``both_predicted``."""
     predicted = both_predicted(windows, theta) if predicted is None else predicted
-    rmse = _roots(windows, _off(windows, predicted))
+    rmse = _roots(windows, _squares(windows, predicted))
     return [
         ChannelScore(log, *channel, float(rmse[0, k, c]), float(rmse[1, k, c]))
         for k, log in enumerate(windows.trajectories.names)
@@ -209,14 +178,7 @@ def _stitched(windows: BoundLikelihood, predicted: FloatArray, log: int) -> Floa
 def signals(
     windows: BoundLikelihood, use: str, predicted: FloatArray, band: tuple[FloatArray, FloatArray]
 ) -> list[Signal]:
-    """What the report draws of each log and channel.
-
-    Args:
-        windows: the logs.
-        use: ``train`` or ``holdout``.
-        predicted: (2, W, L, C) at the mode and by what it is compared with.
-        band: ends (W, L, C).
-    """
+    """What the report draws of each log and channel: predicted (2, W, L, C) at the mode and by another, and bands."""
     every, out = np.concatenate([predicted, np.stack(band)]), []
     for k, trajectory in enumerate(windows.trajectories):
         lines = _stitched(windows, every, k)
@@ -229,60 +191,15 @@ def signals(
     return out
 
 
-def posterior_band(
-    windows: BoundLikelihood, theta: FloatArray, posterior: Posterior, seed: int, here: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """5 and 95 % quantiles (W, L, C) of predictions over a posterior, to first order where it is narrow.
-
-    Args:
-        windows: the logs.
-        theta: (N,) the mode.
-        posterior: whose draws make the band.
-        seed: of the draws.
-        here: (W, L, C), the prediction at theta.
-    """
-    draws = posterior.sample((_BAND_DRAWS,), generator=torch.Generator().manual_seed(seed)).numpy()
-    lines = _band(windows, theta, draws, here)
-    if np.isfinite(lines).all():
-        low, high = np.quantile(lines, [0.05, 0.95], axis=0)  # many times faster than with NaN
-        return low, high
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # samples that no draw reached
-        low, high = np.nanquantile(lines, [0.05, 0.95], axis=0)
-    return low, high
-
-
-def _band(windows: BoundLikelihood, theta: FloatArray, draws: FloatArray, here: FloatArray) -> FloatArray:
-    """Predictions (B, W, L, C) of draws (B, N) about theta (N,), where they are those ``here`` (W, L, C).
-
-    Of a narrow posterior of few parameters by differences over an sd of each, else of fewer draws.
-    """
-    spread = draws.std(0)
-    if spread.max() > _NARROW or len(theta) > _FEW_DRAWS:
-        few = draws[:: max(1, len(draws) // _FEW_DRAWS)]
-        return windows.predict(few, measured_starts(windows, few, theta))[0]
-    step = np.where(theta + spread <= 1, 1.0, -1.0) * np.maximum(spread, windows.theta_step)
-    beside = theta + np.diag(step)
-    slopes = (windows.predict(beside, measured_starts(windows, beside, theta))[0] - here) / step[:, None, None, None]
-    return np.asarray(here + np.tensordot(draws - theta, slopes, axes=1))
-
-
 def white_noise(windows: BoundLikelihood, theta: FloatArray) -> Noise:
     """White noise of the size of the residuals at theta (N,), with the windows' starts at their best."""
-    squares = (_best_residuals(windows, theta)[0] ** 2).sum(axis=(0, 1))
+    squares = (_best_residuals(windows, theta) ** 2).sum(axis=(0, 1))
     size = np.sqrt(squares / np.maximum(windows.observed.sum(axis=(0, 1)), 1))
     return Noise(np.maximum(size, windows.rounding), np.zeros(len(size)))
 
 
 def fitted_residuals(windows: BoundLikelihood, theta: FloatArray, noise: Noise, starts: FloatArray) -> list[Residual]:
-    """Residuals of each log and channel.
-
-    Args:
-        windows: the logs.
-        theta: (N,).
-        noise: (C,) that whitens them.
-        starts: (W, D) of the windows.
-    """
+    """Residuals of each log and channel at theta (N,) and starts (W, D), whitened by noise (C,)."""
     residual = windows.residuals(theta[None], starts[None])[0][0]
     white = np.full(residual.shape, np.nan)
     for c, own in enumerate(windows.whitened(residual[None], noise)):
@@ -298,16 +215,6 @@ def fitted_residuals(windows: BoundLikelihood, theta: FloatArray, noise: Noise, 
     return out
 
 
-def starts_cost(windows: BoundLikelihood) -> int:
-    """Rollouts of ``fit_starts`` at most."""
-    return windows.starts_cost * len(windows.trajectories)
-
-
-def band_cost(windows: BoundLikelihood) -> int:
-    """Rollouts of ``posterior_band`` at most."""
-    return _FEW_DRAWS * len(windows.trajectories)
-
-
 def measured_starts(windows: BoundLikelihood, theta: FloatArray, near: FloatArray | None = None) -> FloatArray:
     """Initial states (B, W, D) of theta (B, N) for free simulations: zero is what was measured.
 
@@ -318,7 +225,7 @@ def measured_starts(windows: BoundLikelihood, theta: FloatArray, near: FloatArra
     inertial = bool(poses) and bool(inertial_joints(windows.simulator.model, poses))
     if not poses or inertial or not windows.num_start or not windows.impacts:
         return windows.no_starts(len(theta))
-    view = windows.beginnings(windows.telling_steps(max(_FEWEST, math.ceil(_FIRST / float(windows.dt.min())))))
+    view = windows.beginnings(windows.telling_steps(max(8, math.ceil(0.1 / float(windows.dt.min())))))
     with windows.counting(view):
         own = [view.fit_starts(at, windows.level)[0] for at in (theta if near is None else near[None])]
     return np.broadcast_to(np.stack(own), (len(theta), *own[0].shape))

@@ -1,12 +1,11 @@
 """Can the model explain the log? Residuals that are not noise.
 
-At the estimate, with parameters and initial states free to follow (linearised, but for parameters that the log presses
-against a bound) and autoregressive noise, two kinds of statistics are looked at.
+In the linear model of ``structure.augmented``, with parameters and initial states free to follow and autoregressive
+noise, two kinds of statistics are looked at.
 
-- *Probes*: a small step of each extension that ``structure`` has a place for, away from the model as it is. The score
-  statistic of its size, all else projected out, is chi-square with one degree of freedom (C. R. Rao 1948,
-  https://doi.org/10.1017/S0305004100023987): the simulation answers what such physics would have done to every sample.
-  A size that may not be negative counts as none where it would be.
+- *Probes*: the score statistic of the size of each extension (C. R. Rao 1948,
+  https://doi.org/10.1017/S0305004100023987), all else projected out. A size that may not be negative counts as none
+  where it would be.
 - *Whiteness* of each channel's whitened residuals: the sum of squared autocorrelations over lags 1, 2, 3, 5, 8, ...
   (G. Box, D. Pierce 1970, https://doi.org/10.1080/01621459.1970.10481180), and the largest mean square of ten pieces of
   time, beside that of all.
@@ -16,69 +15,61 @@ its mean and sd over these and the log's; the largest is compared with the large
 white and first-order autoregressive sensor noise, whatever the number of probes, up to the linearisation.
 
 A small p says that something is there, not that it is large: with it come the share of each channel's residual that the
-named cause explains and, of a probe, how far the estimate would move if the model had it. Named are the extensions that
-the strongest effect of ``structure.single_effects`` may be, those that the logs can hardly tell apart together; what is
-named fits best, it is not proven (``sipe discover`` fits them and compares).
+cause explains and, of a probe, how far the estimate would move if the model had it. Named are the extensions that the
+strongest effect of ``structure.single_effects`` may be.
 
 Deviations:
 
-- The log's own noise is the one that the fit found, of whose estimation the null knows but the first autocorrelation.
+- The log's own noise is that of the fit, of whose estimation the null knows but the first autocorrelation.
 - Probes are of a user's MJCF; of other environments only whiteness is asked, which slow misfit passes as slow noise.
 - Where dry friction holds the simulated joint still, a small step of what acts on it changes nothing, and says nothing.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.options import Options, option
-from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.likelihood import FLAT_PRECISION
 from sipe_bayes.structure.augmented import AUGMENTED, AtNoise
 from sipe_bayes.structure.discrepancy import Discrepancy
 from sipe_bayes.structure.probes import Probe
-from sipe_bayes.structure.single_effects import SingleEffect
+
+_LAGS = (1, 2, 3, 5, 8, 13, 21, 34)  # of a channel's memory, at every scale, in samples
+_PIECES = 10  # of a log, among which the largest mean square is looked for
 
 
-@dataclass(frozen=True)
-class MisfitOptions(Options):
-    """What residuals are asked, and how the null is simulated."""
-
-    simulated: int = option(199, "draws of the null: p resolves half a percent", least=1)
-    pieces: int = option(10, "of a log, among which the largest mean square is looked for", least=1)
-    lags: tuple[int, ...] = option((1, 2, 3, 5, 8, 13, 21, 34), "of a channel's memory, at every scale", "samples")
-
-
-MISFIT = MisfitOptions()
-
-
-def misfit(
-    found: Discrepancy, sd: FloatArray | None = None, seed: int = 0, simulated: int = MISFIT.simulated
-) -> Misfit:
+def misfit(found: Discrepancy, sd: FloatArray | None = None, seed: int = 0, simulated: int = 199) -> Misfit:
     """How odd the residuals of fitted logs are, and what they look like most.
 
     Args:
         found: what the model lacks, or may lack, by the logs linearised at the estimate.
         sd: (N,) of the posterior in theta; default that of the linearisation.
         seed: of the null.
-        simulated: draws of the null.
+        simulated: draws of the null, of which 199 resolve half a percent.
     """
     seen = found.at.logs.seen
     null = statistics(seen, drawn(seen, np.random.default_rng(seed), simulated))
     odd, largest = oddness(statistics(seen, seen.logs.residual[..., None], own=True)[0], null)
     worst, floor = int(odd.argmax()), 1 / (1 + len(largest))
     p = float((1 + (largest >= odd.max()).sum()) * floor)
-    effect = None if found.effects is None else found.effects.single[0]
-    count, says = len(seen.logs.probes), _Says(found, sd, p)
+    sd = np.sqrt(np.diag(seen.projected.covariance)) if sd is None else sd
+    effect, probes = None if found.effects is None else found.effects.single[0], seen.logs.probes
     if effect is not None and effect.present > 0.5:
-        named = replace(says.of_effect(effect), floor=floor)
-        if worst < count or max(named.share.values()) >= THRESHOLDS.small_misfit:
-            return named
-    return replace(says.of_probe(worst) if worst < count else says.of_colour(worst - count), floor=floor)
+        sizes, first = np.zeros(len(probes)), {probes[k].name: probes[k] for k in reversed(found.usable)}
+        sizes[found.usable] = effect.sizes / effect.present
+        causes = [first[name] for name in effect.alike([probes[k].name for k in found.usable])]
+        named = _of_sizes(found.at, sizes, causes, sd, p)
+        if worst < len(probes) or not named.is_small:
+            return replace(named, floor=floor)
+    if worst < len(probes):
+        made, sizes = seen.projected, np.zeros(len(probes))
+        sizes[worst] = made.score[worst] / made.information[worst, worst]
+        return replace(_of_sizes(seen, sizes, [probes[worst]], sd, p), floor=floor)
+    return replace(_of_colour(seen, worst - len(probes), p), floor=floor)
 
 
 def drawn(at: AtNoise, random: np.random.Generator, simulated: int) -> FloatArray:
@@ -140,7 +131,7 @@ def _whiteness(at: AtNoise, left: FloatArray) -> FloatArray:
         at_lags = [((centred[:, k:] * centred[:, :-k]).sum(1) / square) ** 2 for k in lags(z[0])]
         memory.append(z.shape[1] * np.sum(at_lags, axis=0))
         mean = np.maximum((z**2).mean(1), 1e-300)
-        pieces = [(piece**2).mean(1) for piece in np.array_split(z, MISFIT.pieces, axis=1) if piece.size]
+        pieces = [(piece**2).mean(1) for piece in np.array_split(z, _PIECES, axis=1) if piece.size]
         bursts.append(np.max(pieces, axis=0) / mean if pieces else mean)
     none = np.zeros(len(left))
     return np.stack([none + one for one in (*memory, *bursts)])
@@ -149,9 +140,7 @@ def _whiteness(at: AtNoise, left: FloatArray) -> FloatArray:
 def oddness(seen: FloatArray, null: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Statistics of a log (K,) in sds from their mean, and the largest of each draw (n,) of the null (n, K).
 
-    Mean and sd are of the log's and the draws' together, so that under the null each is as likely to be the oddest. By
-    the draws' own, each of which takes part in them, the log's would look odder than it is: with sixty statistics 9 %
-    of right models would raise an alarm at 5 %.
+    Mean and sd are of the log's and the draws' together, so that under the null each is as likely to be the oddest.
     """
     rows = np.vstack([seen, null])
     rows = (rows - rows.mean(0)) / np.maximum(rows.std(0), 1e-12)
@@ -159,99 +148,59 @@ def oddness(seen: FloatArray, null: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def lags(z: FloatArray) -> list[int]:
-    """Of ``MISFIT.lags`` those that z (n,) is long enough for."""
-    return [lag for lag in MISFIT.lags if lag < len(z) // 4]
+    """Those lags that z (n,) is long enough for."""
+    return [lag for lag in _LAGS if lag < len(z) // 4]
 
 
-class _Says:
-    """Says what residuals look like.
-
-    Args:
-        found: what the model lacks.
-        sd: (N,) of theta; default that of the linearisation.
-        p: of the residuals.
-    """
-
-    def __init__(self, found: Discrepancy, sd: FloatArray | None, p: float) -> None:
-        self.found, self.p, self.seen = found, p, found.at.logs.seen
-        self.sd = np.sqrt(np.diag(self.seen.projected.covariance)) if sd is None else sd
-
-    def of_effect(self, effect: SingleEffect) -> Misfit:
-        """That an effect is at work, beside the noise that all of them leave."""
-        probes, usable = self.found.at.logs.probes, self.found.usable
-        sizes = np.zeros(len(probes))
-        sizes[usable] = effect.sizes / max(effect.present, 1e-300)
-        mine = [probes[k] for k in usable]
-        first = {probe.name: probe for probe in reversed(mine)}
-        return self._of(self.found.at, sizes, [first[name] for name in effect.alike([probe.name for probe in mine])])
-
-    def of_probe(self, probe: int) -> Misfit:
-        """That a probe of its best size is, beside the noise of the fit."""
-        made, sizes = self.seen.projected, np.zeros(len(self.seen.logs.probes))
-        sizes[probe] = made.score[probe] / made.information[probe, probe]
-        return self._of(self.seen, sizes, [self.seen.logs.probes[probe]])
-
-    def _of(self, at: AtNoise, sizes: FloatArray, causes: list[Probe]) -> Misfit:
-        """That these are at work, at sizes (K,) of the probes."""
-        logs = at.logs
-        before, after = at.left(np.zeros_like(sizes)), at.left(sizes)
-        whitened = zip(*(logs.windows.whitened(left[None], at.noise) for left in (before, after)), strict=True)
-        gains = [plain[0] ** 2 - other[0] ** 2 for plain, other in whitened]
-        share = np.clip(1 - (after**2).sum((0, 1)) / np.maximum((before**2).sum((0, 1)), 1e-300), 0, 1)
-        moved = logs.traded(sizes) - at.projected.answer @ sizes
-        shift = (np.clip(logs.theta + moved, 0, 1) - logs.theta) / np.maximum(self.sd, 1e-12)
-        cause, remedy = " or ".join(c.name for c in causes), " or ".join(c.remedy for c in causes)
-        moves = dict(zip(logs.windows.simulator.space.names, shift.tolist(), strict=True))
-        placed = self._placed(cause, remedy + "; or run sipe discover", gains, share, moves)
-        return replace(placed, alike=len(causes))
-
-    def of_colour(self, statistic: int) -> Misfit:
-        """That samples follow one another, or are larger for a while; statistic: of 2 C, autocorrelations first."""
-        logs, channels = self.seen.logs, len(self.seen.noise.sd)
-        white = [z[0] for z in logs.windows.whitened(self.seen.left(self.seen.sizes)[None], self.seen.noise)]
-        share, gains = np.zeros(channels), [np.zeros(len(z)) for z in white]
-        c = statistic % channels
-        if statistic < channels:
-            gains[c] = white[c] ** 2 - (white[c] - _foretold(white[c])) ** 2
-            share[c] = gains[c].sum() / max((white[c] ** 2).sum(), 1e-300)
-            cause = "samples that follow one another, as an effect does that no probe stands for"
-            coloured = "look at the residuals' plot for what moves with them"
-            remedy = coloured if logs.coloured else f'use noise = "ar1"; then {coloured}'
-        else:
-            gains[c] = white[c] ** 2
-            most = max(float(piece.sum()) for piece in np.array_split(gains[c], MISFIT.pieces))
-            share[c] = most / max(gains[c].sum(), 1e-300) - 1 / MISFIT.pieces
-            cause = "noise that is larger for a while"
-            remedy = "look at what happened there; leave that span out if it was a disturbance"
-        return self._placed(cause, remedy, gains, np.maximum(share, 0.0), {})
-
-    def _placed(
-        self, cause: str, remedy: str, gains: list[FloatArray], share: FloatArray, shift: dict[str, float]
-    ) -> Misfit:
-        """gains: per channel what each sample contributes."""
-        logs, windows = self.seen.logs, self.seen.logs.windows
-        channel = int(np.argmax([g.sum() for g in gains]))
-        index = windows.sequences[channel].index
-        window, place = index // logs.residual.shape[1], index % logs.residual.shape[1]
-        seconds = (windows.start[window] + place) * windows.dt[window]
-        log, best, where = windows.log[window], -np.inf, np.zeros(1, int)
-        for k in np.unique(log):
-            for piece in np.array_split(np.flatnonzero(log == k), MISFIT.pieces):
-                if len(piece) and gains[channel][piece].sum() > best:
-                    best, where = float(gains[channel][piece].sum()), piece
-        name = windows.trajectories.names[int(log[where[0]])]
-        span = float(seconds[where[0]]), float(seconds[where[-1]])
-        shares = dict(zip(windows.fitted, share.tolist(), strict=True))
-        held = [name for name, free in zip(windows.simulator.space.names, self.seen.free, strict=True) if not free]
-        if held:
-            remedy = f"widen the bounds of {', '.join(held)} first, which the log presses against, or {remedy}"
-        return Misfit(self.p, cause, remedy, name, windows.fitted[channel], *span, shares, shift)
+def _of_sizes(at: AtNoise, sizes: FloatArray, causes: list[Probe], sd: FloatArray, p: float) -> Misfit:
+    """That probes are at work, at sizes (K,), beside the noise that they leave; theta has sds (N,)."""
+    logs = at.logs
+    before, after = at.left(np.zeros_like(sizes)), at.left(sizes)
+    whitened = zip(*(logs.windows.whitened(left[None], at.noise) for left in (before, after)), strict=True)
+    gains = [plain[0] ** 2 - other[0] ** 2 for plain, other in whitened]
+    share = np.clip(1 - (after**2).sum((0, 1)) / np.maximum((before**2).sum((0, 1)), 1e-300), 0, 1)
+    moved = logs.traded(sizes) - at.projected.answer @ sizes
+    shift = (np.clip(logs.theta + moved, 0, 1) - logs.theta) / np.maximum(sd, 1e-12)
+    cause, remedy = " or ".join(c.name for c in causes), " or ".join(c.remedy for c in causes)
+    moves = dict(zip(logs.windows.simulator.space.names, shift.tolist(), strict=True))
+    placed = _placed(logs.seen, p, cause, remedy + "; or run sipe discover", gains, share)
+    return replace(placed, shift=moves, alike=len(causes))
 
 
-def _foretold(z: FloatArray) -> FloatArray:
-    """What least squares on the samples before, at ``MISFIT.lags``, says of z (n,)."""
-    behind = lags(z)
-    if not behind:
-        return np.zeros_like(z)
-    before = np.stack([np.concatenate([np.zeros(lag), z[:-lag]]) for lag in behind], axis=1)
-    return np.asarray(before @ np.linalg.lstsq(before, z, rcond=None)[0])
+def _of_colour(seen: AtNoise, statistic: int, p: float) -> Misfit:
+    """That samples follow one another, or are larger for a while; statistic: of 2 C, autocorrelations first."""
+    logs, channels = seen.logs, len(seen.noise.sd)
+    white = [z[0] for z in logs.windows.whitened(seen.left(seen.sizes)[None], seen.noise)]
+    share, gains = np.zeros(channels), [np.zeros(len(z)) for z in white]
+    c = statistic % channels
+    if statistic < channels:
+        before = [np.concatenate([np.zeros(lag), white[c][:-lag]]) for lag in lags(white[c])]
+        rows = np.stack(before or [np.zeros_like(white[c])], axis=1)
+        gains[c] = white[c] ** 2 - (white[c] - rows @ np.linalg.lstsq(rows, white[c], rcond=None)[0]) ** 2
+        share[c] = gains[c].sum() / max((white[c] ** 2).sum(), 1e-300)
+        cause = "samples that follow one another, as an effect does that no probe stands for"
+        coloured = "look at the residuals' plot for what moves with them"
+        remedy = coloured if logs.coloured else f'use noise = "ar1"; then {coloured}'
+    else:
+        gains[c] = white[c] ** 2
+        most = max(float(piece.sum()) for piece in np.array_split(gains[c], _PIECES))
+        share[c] = most / max(gains[c].sum(), 1e-300) - 1 / _PIECES
+        cause = "noise that is larger for a while"
+        remedy = "look at what happened there; leave that span out if it was a disturbance"
+    return _placed(seen, p, cause, remedy, gains, np.maximum(share, 0.0))
+
+
+def _placed(seen: AtNoise, p: float, cause: str, remedy: str, gains: list[FloatArray], share: FloatArray) -> Misfit:
+    """Where it shows most, by what each sample of each channel contributes; share: (C,) that is explained."""
+    logs, windows = seen.logs, seen.logs.windows
+    channel = int(np.argmax([g.sum() for g in gains]))
+    index = windows.sequences[channel].index
+    window, place = index // logs.residual.shape[1], index % logs.residual.shape[1]
+    seconds, log = (windows.start[window] + place) * windows.dt[window], windows.log[window]
+    parts = [part for k in np.unique(log) for part in np.array_split(np.flatnonzero(log == k), _PIECES) if len(part)]
+    where = max(parts, key=lambda part: float(gains[channel][part].sum()))
+    shares = dict(zip(windows.fitted, share.tolist(), strict=True))
+    if held := [name for name, free in zip(windows.simulator.space.names, seen.free, strict=True) if not free]:
+        remedy = f"widen the bounds of {', '.join(held)} first, which the log presses against, or {remedy}"
+    name, start, stop = windows.trajectories.names[int(log[where[0]])], seconds[where[0]], seconds[where[-1]]
+    return Misfit(p, cause, remedy, name, windows.fitted[channel], float(start), float(stop), shares)

@@ -1,13 +1,13 @@
-"""What single checks of a calibration say, as plain data: errors, signals, residuals, ridges, noise, mixing, logs."""
+"""What single checks of a calibration say, as plain data: errors, signals, residuals, ridges, noise, logs."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from numbers import Real
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
 
 import numpy as np
+import scipy.stats
 
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.findings import Code, Finding, finding, p_text
@@ -16,16 +16,9 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 
 @dataclass(frozen=True)
 class ChannelScore:
-    """Root-mean-square errors of one channel of one log.
+    """RMSE of one channel of one log in its unit, over open-loop windows from measured starts.
 
-    They are over open-loop windows from measured starts, in the channel's unit.
-
-    Args:
-        log: its name.
-        channel: its name.
-        unit: of the errors.
-        rmse: at the posterior mode.
-        rmse_default: with the model as given.
+    ``rmse`` is that of the posterior mode, ``rmse_default`` that of the nominal model.
     """
 
     log: str
@@ -42,19 +35,14 @@ def improvement(scores: Iterable[ChannelScore]) -> float:
     """
     ratios = [s.rmse_default / s.rmse for s in scores if s.rmse > 0 and s.rmse_default > 0]
     ratios = [r for r in ratios if math.isfinite(r)]
-    with np.errstate(divide="ignore"):  # of a model that diverges
-        return float(np.exp(np.mean(np.log(ratios)))) if ratios else math.nan
+    return float(scipy.stats.gmean(ratios)) if ratios else math.nan
 
 
 @dataclass(frozen=True)
 class BandCoverage:
-    """How much of held-out logs the 90 % bands hold.
+    """The share of the samples of held-out logs that the 90 % bands hold, and its standard error by ``pieces``.
 
-    Args:
-        share: of the samples, the mean over pieces of the logs.
-        error: standard error by pieces.
-        pieces: tenths of each log and channel.
-        half: channel -> median half width of its band, and its unit.
+    Pieces are tenths of each log and channel; ``half``: channel -> median half width of its band, and its unit.
     """
 
     share: float
@@ -69,8 +57,7 @@ class Comparison:
 
     Args:
         ratio: how many times, as the geometric mean over logs and channels.
-        low: lower end of its 95 % interval.
-        high: upper end.
+        low, high: ends of its 95 % interval.
         p: of a ratio as far from 1 where the models predict alike; as the interval from a paired t-test.
         pieces: of the logs, over which the test goes.
         starts: share of the calibrated model's error that the measured starts of windows made, where that is nearly
@@ -89,27 +76,18 @@ class Comparison:
         """``better``, ``not better`` or ``worse``."""
         return "not better" if self.p > THRESHOLDS.comparison else "better" if self.ratio > 1 else "worse"
 
-    def to_dict(self) -> dict[str, object]:
-        """As JSON has it."""
-        return {"verdict": self.verdict, **asdict(self)}
-
 
 @dataclass(frozen=True)
 class Signal:
     """One channel of one log for drawing; all arrays (T+1,), NaN where there is nothing.
 
     Args:
-        log: its name.
         use: ``train`` or ``holdout``.
-        channel: its name.
-        unit: of all but time.
-        time: s.
-        measured: what the log holds.
+        unit: of all but time, which is in s.
         mode: prediction at the posterior mode.
-        low: lower end of the 90 % band of what a sensor reads.
-        high: its upper end.
-        default: prediction of the model as given.
-        window_starts: (W,) s, where every window of the log starts anew.
+        low, high: ends of the 90 % band of what a sensor reads.
+        default: prediction of the nominal model.
+        window_starts: (W,) s, where every window of the log begins.
     """
 
     log: str
@@ -127,15 +105,9 @@ class Signal:
 
 @dataclass(frozen=True)
 class Residual:
-    """What the model leaves of one fitted channel of one training log, with the windows' starts at their estimates.
+    """Residual (T+1,) of one fitted channel of one training log, with initial states at their estimates; time in s.
 
-    Args:
-        log: its name.
-        channel: its name.
-        unit: of the residual.
-        time: (T+1,) s.
-        residual: (T+1,).
-        whitened: (T+1,), the residual after the noise model, which should be white with sd 1.
+    ``whitened`` (T+1,) is that after the noise model, which should be white with sd 1.
     """
 
     log: str
@@ -152,10 +124,7 @@ class Ridge:
 
     Args:
         parameters: the members.
-        combination: a sum or product of them, as a formula.
-        value: of the combination.
-        width: its sd.
-        unit: its unit.
+        combination: a sum or product of them, as a formula, with its ``value``, its sd (``width``) and its ``unit``.
         unknown: the members that are not determined alone.
     """
 
@@ -166,30 +135,26 @@ class Ridge:
     unit: str
     unknown: tuple[str, ...]
 
-    def finding(self, code: Code = Code.RIDGE) -> Finding:
-        """It as a finding.
-
-        Args:
-            code: ``RIDGE``, ``RIDGE_TO_RESOLVE`` with the remedy, or ``RIDGE_EXPECTED`` of a planned experiment.
-        """
+    @property
+    def finding(self) -> Finding:
+        """The diagnostic, with the remedy."""
         unit = f" {self.unit}" if self.unit not in ("", "1") else ""
         *others, last = self.unknown
         alone = f"{', '.join(others)} and {last} alone are" if others else f"{last} alone is"
         return finding(
-            code,
+            Code.RIDGE,
             parameters=self.parameters,
             combination=self.combination,
             value=self.value,
             width=self.width,
             unit=unit,
             alone=alone,
-            ridge=self.text if code is Code.RIDGE_TO_RESOLVE else "",
         )
 
     @property
     def text(self) -> str:
         """In words."""
-        return self.finding().text
+        return self.finding.text
 
 
 @dataclass(frozen=True)
@@ -200,10 +165,7 @@ class Misfit:
         p: of residuals as odd as these under a right model with autoregressive noise.
         cause: what fits them best, in words.
         remedy: what to do about it.
-        log: where it shows most.
-        channel: where it shows most.
-        start: s, from where it shows most.
-        stop: s, to where.
+        log, channel: where it shows most, from ``start`` to ``stop``, in s.
         share: for each channel the share of the residual's variance that the cause explains. Where samples follow one
             another, of the whitened residual's that those before foretell; where noise is larger for a while, of its
             squares what that tenth of the time has too many.
@@ -241,21 +203,27 @@ class Misfit:
         return [name for name, sds in self.shift.items() if abs(sds) > THRESHOLDS.far_shift]
 
     @property
+    def is_small(self) -> bool:
+        """Whether the cause explains little of every channel's residual."""
+        return max(self.share.values(), default=0.0) < THRESHOLDS.small_misfit
+
+    @property
     def matters(self) -> bool:
-        """Whether there is an alarm and its cause is not small."""
-        return self.alarm and (max(self.share.values()) >= THRESHOLDS.small_misfit or bool(self.moved))
+        """Whether there is an alarm, and its cause explains much or moves a parameter."""
+        return self.alarm and (not self.is_small or bool(self.moved))
 
     @property
     def finding(self) -> Finding:
-        """It as a finding: about all parameters where it explains much, else about those that move.
+        """The diagnostic: about all parameters where the cause explains much, else about those that move.
 
         A cause that explains much may have the wrong name, and then other parameters move.
         """
-        small = max(self.share.values(), default=0.0) < THRESHOLDS.small_misfit
-        code = Code.MISFIT_SHIFTS if self.moved else Code.MISFIT if self.matters else Code.SMALL_MISFIT
+        moved = ", ".join(f"{name} by {self.shift[name]:+.2g} sd" for name in self.moved)
+        which = "it" if self.alike == 1 else "the first of them"
+        move = f"with {which} in the model the estimate would move, {moved}"
         return finding(
-            code if self.alarm else Code.NO_MISFIT,
-            parameters=self.moved if self.matters and small else (),
+            Code.MISFIT if self.matters else Code.SMALL_MISFIT,
+            parameters=self.moved if self.is_small else (),
             log=self.log,
             p=self.p_text,
             cause=self.cause,
@@ -263,27 +231,17 @@ class Misfit:
             channel=self.channel,
             start=self.start,
             stop=self.stop,
-            moved=", ".join(f"{name} by {self.shift[name]:+.2g} sd" for name in self.moved),
+            effect=move if moved else "do not trust the intervals' width",
             remedy=self.remedy,
-            which="it" if self.alike == 1 else "the first of them",
             far=THRESHOLDS.far_shift,
         )
-
-    @property
-    def text(self) -> str:
-        """In a sentence."""
-        return self.finding.text
 
 
 @dataclass(frozen=True)
 class ChannelNoise:
-    """Sensor noise of one channel.
+    """Sensor noise of one channel: sd in its unit, and correlation time ``tau`` in s, 0 where it is white.
 
-    Args:
-        sd: in ``unit``.
-        tau: correlation time in s; 0 where it is white.
-        unit: of the channel.
-        tau_at_limit: whether ``tau`` is the longest that the logs can tell, their length: it may be longer.
+    ``tau_at_limit``: whether ``tau`` is the longest that the logs can tell, their length: it may be longer.
     """
 
     sd: float
@@ -293,66 +251,13 @@ class ChannelNoise:
 
 
 @dataclass(frozen=True)
-class Mixing:
-    """How well Markov chains have mixed.
-
-    Args:
-        overall: numbers of the whole chain by name: ``rhat``, ``ess``, ``acceptance``, ``steps``, ...
-        by_parameter: for each measure that is told by parameter, the number of each.
-    """
-
-    overall: Mapping[str, float] = field(default_factory=dict)
-    by_parameter: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, measured: Mapping[str, object], names: Sequence[str]) -> Mixing:
-        """Read what an estimator's diagnostics hold.
-
-        Args:
-            measured: numbers, or by parameter mappings or sequences in the order of ``names``; all else is left out.
-            names: of the parameters.
-        """
-        overall: dict[str, float] = {}
-        each: dict[str, dict[str, float]] = {}
-        for key, value in measured.items():
-            if isinstance(value, Real):
-                overall[key] = value if isinstance(value, int) else float(value)
-            elif isinstance(value, Mapping):
-                each[key] = {str(name): float(number) for name, number in value.items()}
-            elif isinstance(value, Sequence | np.ndarray) and not isinstance(value, str) and len(value) == len(names):
-                each[key] = dict(zip(names, map(float, value), strict=True))
-        return cls(overall, each)
-
-    @property
-    def worst(self) -> tuple[float, str] | None:
-        """Largest R-hat and the parameter that it is of, empty where that is not told; None without any."""
-        each = self.by_parameter.get("rhat")
-        if each:
-            name = max(each, key=lambda n: each[n])
-            return each[name], name
-        return (self.overall["rhat"], "") if "rhat" in self.overall else None
-
-    def to_dict(self) -> dict[str, object]:
-        """As JSON has it; what is not finite is None."""
-        return {
-            **{k: v if np.isfinite(v) else None for k, v in self.overall.items()},
-            **{k: dict(v) for k, v in self.by_parameter.items()},
-        }
-
-
-@dataclass(frozen=True)
 class LogReport:
     """What a log held and what was done to it.
 
     Args:
-        name: of the log.
-        file: its path.
-        sha256: of the file.
-        rate_hz: of the control grid.
-        duration_s: of the trajectory.
-        samples: T+1.
+        file: its path, and the ``sha256`` of what it holds.
+        rate_hz: of the control grid, which has T+1 ``samples``.
         jitter_s: largest distance of a sample period from the median one, or, over dropped rows, from a multiple of it.
-        resampled: whether samples were interpolated.
         gaps: (start, stop) in s from the trajectory's first sample, without a measurement for longer than ``max_gap``.
         missing: masked samples of each channel.
         wild: samples of each channel left out at reading or by the fit, since no smooth motion explains them.
@@ -384,7 +289,19 @@ class LogReport:
         """Whether the log is not simply as it was recorded, so that the user should read the notes."""
         return bool(self.gaps or self.resampled or any(self.missing.values()) or any(self.clipped.values()))
 
-    def to_dict(self) -> dict[str, object]:
-        """As JSON has it."""
-        plain = {k: v for k, v in asdict(self).items() if k != "findings"}
-        return {**plain, "gaps": [list(gap) for gap in self.gaps], "notes": list(self.notes)}
+
+_DERIVED = {Comparison: ("verdict",), Misfit: ("alarm", "matters"), Ridge: ("text",), LogReport: ("notes",)}
+
+
+def plain(value: object) -> object:
+    """Records, in collections too, as JSON has them: their fields, what is derived from them, and no array."""
+    if isinstance(value, Finding):
+        return value.to_dict()
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if not is_dataclass(value):
+        return value
+    names = [f.name for f in fields(value) if not isinstance(getattr(value, f.name), np.ndarray)]
+    return {name: plain(getattr(value, name)) for name in (*names, *_DERIVED.get(type(value), ()))}

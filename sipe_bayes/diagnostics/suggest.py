@@ -1,73 +1,73 @@
 """Which experiment next? Command sequences ranked by what they are expected to tell of the parameters asked for.
 
-For each candidate, the contraction of each parameter's sd that its Fisher information promises
-(``diagnostics.expected``), averaged over draws of what is known now and over the parameters asked for. Candidates are
-given, or generated within each actuator's limits:
+At theta the simulation of planned commands is linearised as ``laplace`` would linearise the log, initial states unknown
+and marginalised, noise as given; what is left is the Fisher information I(theta) = J' V^-1 J of the parameters alone.
+With the present knowledge, a normal of precision P, the experiment leaves the covariance (P + I)^-1: D. Lindley 1956,
+"On a measure of the information provided by an experiment" (https://doi.org/10.1214/aoms/1177728069). The score of a
+candidate is the A-criterion (K. Chaloner, I. Verdinelli 1995, https://doi.org/10.1214/ss/1177009939) in sds: the
+contraction of each parameter's sd, averaged over draws of theta and over the parameters asked for. A parameter of one
+log (a zero error) learns nothing from another one.
+
+Candidates are given, or generated within each actuator's limits:
 
 - chirps: the frequency goes from one end of the band to the other, up or down, by equal factors in equal times;
-- band-limited noise: white noise through a Butterworth band-pass filter of second order, scaled to its largest value;
-- sums of sines of random phases, as many as the band holds multiples of 1 / duration, at most ten (M. Schroeder 1970,
-  "Synthesis of low-peak-factor signals", https://doi.org/10.1109/TIT.1970.1054411, chooses phases; here they are
-  drawn).
+- sums of at most ten sines of random phases, at multiples of 1 / duration.
 
 A candidate ends as it began, within a tenth of its duration, at zero or the middle of the limits. One that diverges at
-a draw counts there as telling nothing. Whether the machine may go where a candidate takes it is not known here; so what
-each reaches is stated, and those that take a measured quantity further than logs went, by more than half of what that
-was in all, come after those that do not and tell half as much as the best at least.
+a draw counts there as telling nothing. Those that take a measured quantity further than logs went, by more than half of
+what that was in all, come after those that do not and tell half as much as the best at least: whether the machine may
+go there is not known here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.signal
 import torch
 
-from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.options import Options, option
-from sipe_bayes.diagnostics.expected import Plan, contraction, informations, knowledge
-from sipe_bayes.likelihood import Noise, Segments
+from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.parameters import ParameterSpace
+from sipe_bayes.core.trajectory import Trajectories, Trajectory
+from sipe_bayes.likelihood import UNIFORM_PRECISION, Noise, Segments, bind
 from sipe_bayes.posterior import Posterior
 from sipe_bayes.simulation.simulator import Simulator
 
-KINDS = ("chirp up", "chirp down", "noise", "sines")
+KINDS = ("chirp up", "chirp down", "sines")
 
 
 @dataclass(frozen=True)
-class SequenceOptions(Options):
-    """How command sequences are made."""
+class Plan:
+    """An experiment from the model's own initial state: actions (T, A), each held for dt s."""
 
-    sizes: tuple[float, ...] = option((1.0, 0.5, 0.25), "in turn", "of the limits")
-    sines: int = option(10, "at most, in a sum", least=1)
-    beyond: float = option(0.5, "of what logs reached of a channel, beyond which a sequence strays", above=0)
-    worth: float = option(0.5, "of the best score, from which a sequence that does not stray goes before", least=0)
-    edge: float = option(0.05, "at either end, over which it begins and ends", "of the duration", above=0)
-
-
-_OPTIONS = SequenceOptions()
+    actions: FloatArray
+    dt: float
+    name: str = "planned"
 
 
 @dataclass(frozen=True)
 class Suggestion:
-    """A plan and its worth.
+    """A plan, the expected contraction of each parameter's sd, and the mean over those asked for (``score``).
 
     Args:
-        plan: the experiment.
-        score: mean contraction of the parameters asked for.
-        contraction: (N,) expected of each parameter's sd.
-        reach: (C, 2) lowest and highest value of each channel over the draws.
+        reach: lowest and highest value of each channel over the draws.
         diverged: at how many of the draws.
-        strays: numbers of the channels that go far beyond what logs reached.
+        strays: the channels that go far beyond what logs reached.
     """
 
     plan: Plan
     score: float
-    contraction: FloatArray
-    reach: FloatArray
+    contraction: dict[str, float]
+    reach: dict[str, tuple[float, float]]
     diverged: int
-    strays: tuple[int, ...] = ()
+    strays: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, object]:
+        """As JSON has it, without the commands."""
+        return {"name": self.plan.name} | {key: value for key, value in vars(self).items() if key != "plan"}
 
 
 def rank(
@@ -81,7 +81,6 @@ def rank(
     reached: FloatArray | None = None,
     draws: int = 4,
     seed: int = 0,
-    tell: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[Suggestion]:
     """Plans, the most telling first of those that do not stray, then the others.
 
@@ -95,7 +94,6 @@ def rank(
         reached: (C, 2) lowest and highest value of each channel in logs; default none, of which nothing strays.
         draws: of ``known``, over which the gain is averaged.
         seed: of the draws.
-        tell: called with how many plans are done, and of how many.
 
     Raises:
         ValueError: for unknown names, and for those of one log.
@@ -109,43 +107,73 @@ def rank(
         raise ValueError(f"names: {old[0]!r} is of a log that is there already; a new one tells nothing of it")
     wanted = [j for j, p in enumerate(space) if (p.name in names if names else p.log is None)]
     thetas = known.sample((draws,), generator=torch.Generator().manual_seed(seed)).numpy()
-    precision, ranked = knowledge(known), []
-    nothing = np.zeros((len(space), len(space)))
-    for number, plan in enumerate(plans):
-        tell(number, len(plans))
-        gains = informations(simulator, likelihood, plan, noise, thetas)
-        lost = draws - len(gains)
-        gain = contraction(precision, gains + [nothing] * lost)
-        reach = _reach(simulator, plan, thetas)
-        far = () if reached is None else _strays(reach, reached)
-        ranked.append(Suggestion(plan, float(gain[wanted].mean()), gain, reach, lost, far))
-    worth = _OPTIONS.worth * max((one.score for one in ranked), default=0.0)
+    nothing, ranked = np.zeros((len(space), len(space))), []
+    start, channels = simulator.default_state(), simulator.environment.channels
+    precision = np.asarray(np.linalg.inv(known.covariance.numpy() + 1e-12 * np.eye(len(space))), np.float64)
+    for plan in plans:
+        gains = [information(simulator, likelihood, plan, noise, theta) for theta in thetas]
+        lost = sum(gain is None for gain in gains)
+        gain = contraction(precision, [nothing if gain is None else gain for gain in gains])
+        motion = simulator.rollout(thetas, plan.actions[None], start[None], plan.dt, [plan.name] * draws)
+        seen = np.where(motion.valid[..., None], motion.observations, np.nan)
+        reach = np.stack([np.nanmin(seen, axis=(0, 1)), np.nanmax(seen, axis=(0, 1))], axis=1)
+        far = [] if reached is None else np.flatnonzero(_strays(reach, reached)).tolist()
+        each = dict(zip(space.names, gain.tolist(), strict=True))
+        ends = {channel: (low, high) for channel, (low, high) in zip(channels, reach.tolist(), strict=True)}
+        ranked.append(Suggestion(plan, float(gain[wanted].mean()), each, ends, lost, tuple(channels[c] for c in far)))
+    worth = 0.5 * max((one.score for one in ranked), default=0.0)
     return sorted(ranked, key=lambda one: (bool(one.strays) or one.score < worth, -one.score))
 
 
-def _strays(reach: FloatArray, reached: FloatArray) -> tuple[int, ...]:
-    """Numbers of the channels of which a reach (C, 2) goes far beyond another."""
-    room = _OPTIONS.beyond * np.diff(reached, axis=1)[:, 0]
+def information(
+    simulator: Simulator, likelihood: Segments, plan: Plan, noise: Noise, theta: FloatArray
+) -> FloatArray | None:
+    """Fisher information (N, N) of a plan at theta (N,), its own nuisances marginalised; None where it diverges."""
+    start = simulator.default_state()[None]
+    motion = simulator.rollout(theta[None], plan.actions[None], start, plan.dt, [plan.name])
+    if motion.states is None or not motion.valid.all():
+        return None
+    log = Trajectory(
+        motion.observations[0], plan.actions, plan.dt, motion.states[0], plan.name, simulator.environment.channels
+    )
+    windows = bind(likelihood, simulator, Trajectories.stack(log))
+    windows.start_precision = windows.weak_precision  # without noise it would seem to be measured exactly
+    linearisation = windows.linearise(theta, windows.no_starts())
+    if not linearisation.valid:
+        return None
+    normal = windows.moments(linearisation).normal(noise)
+    return _of_shared(windows.eliminate(normal, windows.num_theta).precision, simulator.space)
+
+
+def _of_shared(plain: FloatArray, space: ParameterSpace) -> FloatArray:
+    """Information (N, N) with a new value, marginalised, in place of each nuisance of one log.
+
+    The simulation takes the mean of K logs for it, whose uniform prior is that of K values K times as uncertain.
+    """
+    own, shared = ([j for j, p in enumerate(space) if (p.log is None) == common] for common in (False, True))
+    logs = Counter(space[j].targets for j in own)
+    loose = np.array([UNIFORM_PRECISION / logs[space[j].targets] for j in own])
+    cross, inner = plain[np.ix_(shared, own)], plain[np.ix_(own, own)] + np.diag(loose)
+    marginal = np.zeros_like(plain)
+    marginal[np.ix_(shared, shared)] = plain[np.ix_(shared, shared)] - cross @ np.linalg.solve(inner, cross.T)
+    return marginal
+
+
+def contraction(precision: FloatArray, gains: Sequence[FloatArray]) -> FloatArray:
+    """Expected 1 - sd afterwards / sd now (N,), by the precision (N, N) now and informations (N, N) of the plan."""
+    after = np.mean([np.sqrt(np.diag(np.linalg.inv(precision + gain))) for gain in gains], axis=0)
+    return np.asarray(1 - after / np.sqrt(np.diag(np.linalg.inv(precision))))
+
+
+def _strays(reach: FloatArray, reached: FloatArray) -> BoolArray:
+    """Of which channels (C,) a reach (C, 2) goes far beyond another."""
+    room = 0.5 * np.diff(reached, axis=1)[:, 0]
     far = (reach[:, 0] < reached[:, 0] - room) | (reach[:, 1] > reached[:, 1] + room) | ~np.isfinite(reach).all(1)
-    return tuple(np.flatnonzero(far & np.isfinite(reached).all(1)).tolist())
-
-
-def _reach(simulator: Simulator, plan: Plan, thetas: FloatArray) -> FloatArray:
-    start = simulator.default_state() if plan.start is None else plan.start
-    motion = simulator.rollout(thetas, plan.actions[None], start[None], plan.dt, [plan.name] * len(thetas))
-    seen = np.where(motion.valid[..., None], motion.observations, np.nan)
-    return np.stack([np.nanmin(seen, axis=(0, 1)), np.nanmax(seen, axis=(0, 1))], axis=1)
+    return np.asarray(far & np.isfinite(reached).all(1))
 
 
 def limits(simulator: Simulator, recorded: FloatArray | None = None) -> FloatArray:
-    """Lowest and highest command of each actuator.
-
-    Args:
-        simulator: of the model, whose control ranges come first.
-        recorded: (T, A) what was commanded before.
-
-    Returns:
-        (A, 2).
+    """Lowest and highest command (A, 2) of each actuator: its control range, else of what was ``recorded`` (T, A).
 
     Raises:
         ValueError: where neither tells.
@@ -168,7 +196,7 @@ def limits(simulator: Simulator, recorded: FloatArray | None = None) -> FloatArr
 def generate(
     count: int, duration: float, dt: float, bounds: FloatArray, band: tuple[float, float], seed: int = 0
 ) -> list[Plan]:
-    """Plans of all kinds in turn, of all sizes in turn.
+    """So many plans of all kinds and sizes in turn.
 
     Args:
         count: how many.
@@ -176,7 +204,7 @@ def generate(
         dt: s that a command is held.
         bounds: (A, 2) lowest and highest command.
         band: lowest and highest frequency, Hz.
-        seed: of noise and phases.
+        seed: of the phases.
 
     Raises:
         ValueError: for a band that the duration or dt cannot hold.
@@ -190,10 +218,10 @@ def generate(
         )
     rng = np.random.default_rng(seed)
     time = np.asarray(np.arange(steps) * dt, np.float64)
-    edge = np.clip(np.minimum(time, time[-1] - time) / (_OPTIONS.edge * duration), 0.0, 1.0)
+    edge = np.clip(np.minimum(time, time[-1] - time) / (0.05 * duration), 0.0, 1.0)
     plans = []
     for number in range(count):
-        kind, size = KINDS[number % len(KINDS)], _OPTIONS.sizes[number // len(KINDS) % len(_OPTIONS.sizes)]
+        kind, size = KINDS[number % len(KINDS)], (1.0, 0.5, 0.25)[number // len(KINDS) % 3]
         waves = np.stack([_wave(kind, time, low, high, rng) for _ in bounds], axis=1)
         middle, half = bounds.mean(1), np.diff(bounds, axis=1)[:, 0] / 2
         rest = np.clip(0.0, bounds[:, 0], bounds[:, 1])
@@ -204,45 +232,13 @@ def generate(
 
 def _wave(kind: str, time: FloatArray, low: float, high: float, rng: np.random.Generator) -> FloatArray:
     """One actuator's wave (T,) within -1 and 1."""
-    phase = rng.uniform(0, 2 * np.pi)
     if kind.startswith("chirp"):
         ends = (low, high) if kind.endswith("up") else (high, low)
-        ratio = ends[1] / ends[0]
-        swept = ends[0] * time[-1] / np.log(ratio) * (ratio ** (time / time[-1]) - 1)
-        return np.asarray(np.sin(2 * np.pi * swept + phase))
-    if kind == "noise":
-        dt = time[1] - time[0]
-        sections = scipy.signal.butter(2, [low, high], "bandpass", fs=1 / dt, output="sos")
-        wave = scipy.signal.sosfiltfilt(sections, rng.standard_normal(len(time)), padlen=0)
-    else:
-        multiples = np.arange(np.ceil(low * time[-1]), np.floor(high * time[-1]) + 1)
-        if not len(multiples):  # a narrow band
-            multiples = np.array([np.sqrt(low * high) * time[-1]])
-        chosen = rng.choice(multiples, min(_OPTIONS.sines, len(multiples)), replace=False) / time[-1]
-        wave = np.sin(2 * np.pi * chosen * time[:, None] + rng.uniform(0, 2 * np.pi, len(chosen))).sum(1)
+        swept = scipy.signal.chirp(time, ends[0], time[-1], ends[1], "logarithmic", rng.uniform(0, 360))
+        return np.asarray(swept)
+    multiples = np.arange(np.ceil(low * time[-1]), np.floor(high * time[-1]) + 1)
+    if not len(multiples):  # a narrow band
+        multiples = np.array([np.sqrt(low * high) * time[-1]])
+    chosen = rng.choice(multiples, min(10, len(multiples)), replace=False) / time[-1]
+    wave = np.sin(2 * np.pi * chosen * time[:, None] + rng.uniform(0, 2 * np.pi, len(chosen))).sum(1)
     return np.asarray(wave / np.abs(wave).max())
-
-
-def to_dict(suggestions: Sequence[Suggestion], simulator: Simulator, names: Sequence[str]) -> dict[str, object]:
-    """As JSON has it, the best first.
-
-    Args:
-        suggestions: as of ``rank``.
-        simulator: of the model.
-        names: of the parameters that count; default all.
-    """
-    space, channels = simulator.space, simulator.environment.channels
-    return {
-        "parameters": list(names or space.names),
-        "candidates": [
-            {
-                "name": one.plan.name,
-                "score": one.score,
-                "contraction": dict(zip(space.names, one.contraction.tolist(), strict=True)),
-                "reach": dict(zip(channels, one.reach.tolist(), strict=True)),
-                "diverged": one.diverged,
-                "strays": [channels[c] for c in one.strays],
-            }
-            for one in suggestions
-        ],
-    }

@@ -296,14 +296,10 @@ def chains(calibration: Calibration) -> list[Figure]:
     step = -(-traces.shape[1] // SIZES.trace)
     values = space.values(traces[:, ::step])
     names = [p.name for p in ordered(calibration.parameters)]
-    each = calibration.mixing.by_parameter if calibration.mixing else {}
-    scores = [each.get(key, {}) for key in ("rhat", "ess")]
-    return [_chain_figure(part, values, step, calibration, scores) for part in equal_parts(names, SIZES.chains)]
+    return [_chain_figure(part, values, step, calibration) for part in equal_parts(names, SIZES.chains)]
 
 
-def _chain_figure(
-    names: Sequence[str], values: FloatArray, step: int, calibration: Calibration, scores: Sequence[Mapping[str, float]]
-) -> Figure:
+def _chain_figure(names: Sequence[str], values: FloatArray, step: int, calibration: Calibration) -> Figure:
     figure, axes = column_of_panels(len(names), 1.1, 0.5)
     space = calibration.posterior.space
     draw = np.arange(values.shape[1]) * step
@@ -311,12 +307,7 @@ def _chain_figure(
         j = space.index(name)
         for chain, colour in zip(values[:, :, j], np.resize(CHAINS, len(values)), strict=True):
             ax.plot(draw, chain, color=str(colour), lw=0.6, alpha=0.6)
-        texts = [
-            f"{word} {score[name]:{style}}"
-            for score, word, style in zip(scores, ("R-hat", "effective draws"), (".3f", ".0f"), strict=True)
-            if name in score
-        ]
-        ax.set_title(", ".join([shortened(name, 50), *texts]), loc="left")
+        ax.set_title(shortened(name, 50), loc="left")
         ax.set_yscale(scale(space[j], view(space[j].normalise(values[:, :, j]).ravel())))
         ax.set_ylabel(unit_text(space[j].unit) or "no unit")
         ax.set_xlim(0, max(draw[-1], 1))

@@ -25,8 +25,8 @@ from sipe_bayes.core.findings import Code, Finding, Findings, Guard, Severity
 from sipe_bayes.core.html import Page
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.thresholds import THRESHOLDS
-from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, LogReport, Mixing, improvement
-from sipe_bayes.diagnostics.result import PROCESS_NOISE, Calibration, ParameterSummary
+from sipe_bayes.diagnostics.records import ChannelNoise, ChannelScore, Comparison, LogReport, improvement
+from sipe_bayes.diagnostics.result import Calibration, ParameterSummary
 from sipe_bayes.report import calibration_plots as plots
 from sipe_bayes.report.drawing import inside_page, png, uncollected
 from sipe_bayes.report.interactive.charts import charts
@@ -145,14 +145,6 @@ def run_details(run: Mapping[str, object]) -> list[tuple[str, str]]:
     return [(key.replace("_", " "), text) for key, text in texts.items()]
 
 
-def _mixing_rows(mixing: Mixing, names: Sequence[str]) -> dict[str, object]:
-    """Numbers by parameter as a table, all else as a list."""
-    table = mixing.by_parameter
-    rows = [[name, *(number(column.get(name), 4) for column in table.values())] for name in names]
-    other = [(key, number(value, 4)) for key, value in mixing.overall.items()]
-    return {"head": list(table), "rows": rows if table else [], "other": other}
-
-
 # Figures
 
 
@@ -241,12 +233,11 @@ def _context(calibration: Calibration, images: Sequence[Picture], clip: Clip | N
         ],
         "compared": _compared(calibration.comparison),
         "ridges": [ridge.text for ridge in calibration.ridges],
-        "left_out": calibration.left_out,
         "sections": sections,
         "charts": charts(calibration.signals, [log for log, _ in _logs(calibration)], "calibrated", "model as given"),
         "clip": clip,
         "noise": [_noise_row(channel, noise) for channel, noise in calibration.noise.items()],
-        "mixing": _mixing_rows(calibration.mixing, space.names) if calibration.mixing else None,
+        "mixing": [(key, number(value, 4)) for key, value in calibration.mixing.items()],
         "logs": [_log_row(log, uses.get(log.name, "")) for log in calibration.logs],
         "details": run_details(calibration.run),
         "limits": {"well": f"{100 * THRESHOLDS.well_determined:.0f} %"},
@@ -255,8 +246,7 @@ def _context(calibration: Calibration, images: Sequence[Picture], clip: Clip | N
 
 def notes(calibration: Calibration) -> list[Finding]:
     """Those that no other part of the page has."""
-    own = (item for item in calibration.findings if item.severity is Severity.NOTE and item.log is None)
-    return [item for item in own if item.code not in (Code.RESIDUALS_LEFT_OUT, *PROCESS_NOISE)]
+    return [item for item in calibration.findings if item.severity is Severity.NOTE and item.log is None]
 
 
 def noticed(findings: Iterable[Finding]) -> list[dict[str, object]]:

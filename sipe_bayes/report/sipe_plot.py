@@ -108,7 +108,7 @@ def measured(scores: Scores, measure: Measure, mode: Mode) -> float:
         The number; NaN where the prior is exact and skill has no meaning.
     """
     if measure == "accuracy":
-        return {"mean": scores.mean_accuracy, "min": scores.min_accuracy, "max": scores.max_accuracy}[mode]
+        return {"mean": scores.mean_accuracy, "min": min(scores.accuracy), "max": max(scores.accuracy)}[mode]
     if scores.skill_over_prior is None:
         return float("nan")
     if scores.mean_crps == 0.0:

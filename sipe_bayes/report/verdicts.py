@@ -26,12 +26,10 @@ _PROBLEMS = (
     Code.NO_EFFECT,
     Code.NOT_DETERMINED,
     Code.LOGS_DISAGREE,
-    Code.LOGS_DISAGREE_UNEXPLAINED,
     Code.MISFIT,
-    Code.MISFIT_SHIFTS,
 )
 """Findings for which a parameter's value is not to be trusted, in the order in which its row names them."""
-_ALLOWED_FOR = (Code.LOGS_DISAGREE, Code.LOGS_DISAGREE_UNEXPLAINED, Code.MISFIT, Code.MISFIT_SHIFTS)
+_ALLOWED_FOR = (Code.LOGS_DISAGREE, Code.MISFIT)
 """Those of which the intervals with what the model lacks take account."""
 _SEEN = (*_ALLOWED_FOR, Code.SMALL_MISFIT)
 """Those that show that it lacks something; without one its intervals allow for what does not show."""
@@ -65,7 +63,7 @@ def _hangs(parameter: ParameterSummary, findings: Findings) -> bool:
 def _of_the_logs(parameter: ParameterSummary, findings: Findings) -> Verdict:
     """The same as if all numbers that no log tells were right."""
     codes = {item.code for item in findings.about(parameter.name)}
-    on_ridge = [r.parameters for r in findings.of(Code.RIDGE_TO_RESOLVE) if parameter.name in r.parameters]
+    on_ridge = [r.parameters for r in findings.of(Code.RIDGE) if parameter.name in r.parameters]
     others = list(dict.fromkeys(n for names in on_ridge for n in names if n != parameter.name))
     shared = bool(others) and parameter.contraction < THRESHOLDS.well_determined and Code.NO_EFFECT not in codes
     if shared:
@@ -312,15 +310,12 @@ def _would_be(calibration: Calibration, name: str, sds: float) -> str:
 
 def mixing_verdict(calibration: Calibration) -> Verdict | None:
     """Whether the Markov chains have mixed, when there are any that say so."""
-    worst = None if calibration.mixing is None else calibration.mixing.worst
-    if worst is None:
+    rhat = calibration.mixing.get("rhat")
+    if rhat is None:
         return None
-    rhat, name = worst
     if rhat <= THRESHOLDS.mixed:
         return Verdict("good", f"The chains have mixed (largest R-hat {rhat:.3f}).")
-    where = f" in {name}" if name else ""
-    text = f"The chains have NOT mixed (R-hat {rhat:.2f}{where}): do not use the intervals yet."
-    return Verdict("bad", text)
+    return Verdict("bad", f"The chains have NOT mixed (R-hat {rhat:.2f}): do not use the intervals yet.")
 
 
 def verdicts(calibration: Calibration, brief: bool = False) -> list[Verdict]:

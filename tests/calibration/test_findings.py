@@ -49,7 +49,7 @@ def behaviour(calibration: Calibration) -> dict[str, Any]:
         "flags": {p.name: calibration.flags(p.name) for p in calibration.parameters},
         "rows": [parameter_verdict(p, findings).tone for p in calibration.parameters],
         "top": [v.tone for v in verdicts(calibration)],
-        "counts": [len(plain[key]) for key in ("warnings", "doubts", "left_out", "findings")],  # type: ignore[arg-type]
+        "counts": [len(plain[key]) for key in ("warnings", "doubts", "findings")],  # type: ignore[arg-type]
         "keys": sorted(plain),
     }
 
@@ -58,7 +58,7 @@ def calibrations() -> dict[str, Calibration]:
     """One with each finding about its first parameter, one with all of them, one with chains that have not mixed."""
     plain = dataclasses.replace(make_calibration(), findings=())
     names = plain.posterior.space.names
-    ridge = made(Code.RIDGE_TO_RESOLVE, *names[-2:])
+    ridge = made(Code.RIDGE, *names[-2:])
     every = [made(code, names[0]) for code in Code]
     cases = {str(item.code): dataclasses.replace(plain, findings=(item, ridge)) for item in every}
     cases["blocking"] = dataclasses.replace(plain, findings=(made(Code.NOT_EXPORTED, severity=Severity.BLOCKING),))
@@ -78,9 +78,9 @@ def test_every_code_has_a_text_and_no_place_is_forgotten() -> None:
 def test_no_text_changes_what_a_calibration_is_taken_for(monkeypatch: pytest.MonkeyPatch) -> None:
     before = {name: behaviour(calibration) for name, calibration in calibrations().items()}
     assert len({str(seen) for seen in before.values()}) > len(Code) / 2  # the cases differ
-    assert {flag for seen in before.values() for flags in seen["flags"].values() for flag in flags} == set(
-        FLAGS.values()
-    )
+    assert {flag for seen in before.values() for flags in seen["flags"].values() for flag in flags} == {
+        str(code) for code in FLAGS
+    }
     texts = {name: calibration.warnings for name, calibration in calibrations().items()}
     change_all(monkeypatch)
     after = calibrations()
@@ -122,7 +122,7 @@ def test_a_run_does_the_same_in_other_words(tmp_path: Path, monkeypatch: pytest.
     codes = {item.code for item in found.findings}
     print(codes)
     assert {Code.SEARCH_SPREAD, Code.LOG_GAP} <= codes
-    assert codes & {Code.MISFIT, Code.MISFIT_SHIFTS, Code.SMALL_MISFIT}
+    assert codes & {Code.MISFIT, Code.SMALL_MISFIT}
     assert len(codes) >= 5
     change_all(monkeypatch)
     other_code, other, other_written = calibrated(tmp_path / "after", monkeypatch)

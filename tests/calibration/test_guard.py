@@ -37,10 +37,10 @@ CHECKS = [
     ),
     *(check.value for check in Check),
     *("agreement of the logs", "intervals with what the model lacks", "summaries with what the model lacks", "ridges"),
-    *("noise of the channels", "mixing of the chains", "coverage of the bands", "signals"),
+    *("noise of the channels", "coverage of the bands", "signals"),
     *("samples left out of each log", "alarms", "unmeasured starts"),
     *("diagnostics of the estimator", "rigid bodies", "diagnostics of the checks", "drifting noise", "uneven targets"),
-    *("disagreement", "worth measuring", "ridges to resolve", "bounds and contraction", "errors that grew"),
+    *("disagreement", "ridges to resolve", "bounds and contraction", "errors that grew"),
     *("logs as read", "process noise"),
 ]
 

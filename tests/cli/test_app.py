@@ -62,7 +62,7 @@ def test_json_is_one_object(finished: tuple[Path, Path, Any]) -> None:
     assert result.stdout.count("\n") == 1
     assert result.stderr == ""
     found = strict_json(result.stdout)
-    assert {"parameters", "holdout", "train", "warnings", "rollouts", "seconds", "out", "left_out"} <= set(found)
+    assert {"parameters", "holdout", "train", "warnings", "rollouts", "seconds", "out"} <= set(found)
     assert found["comparison"]["verdict"] == "better"
     assert found["misfit"]["p"] > 0.05  # a right model: fails for one seed in twenty, and this is not one
     assert set(found["misfit"]["share"]) == {"angle"}
@@ -201,13 +201,14 @@ def test_state_space_leaves_out_what_does_not_apply_and_says_so(tmp_path: Path, 
     assert result.exit_code == 0, result.stderr
     found = strict_json(result.stdout)
     assert found["misfit"] is None
-    assert "state is unknown at every sample" in found["left_out"][0]
-    assert "Process noise is largest in the position of hinge" in found["left_out"][1]
+    texts = {item["code"]: item["text"] for item in found["findings"]}
+    assert "state is unknown at every sample" in texts["residuals_left_out"]
+    assert "Process noise is largest in the position of hinge" in texts["process_noise"]
     assert (found["comparison"]["verdict"], len(found["outside_prior"])) == ("better", 1)
     assert found["noise"]["angle"]["tau"] == 0
     for p in found["parameters"]:  # 5 sd: one in a million
         assert abs(p["mean"] - TRUTH[p["name"]]) < 5 * p["sd"]
-    assert "Left out. Residuals" in (tmp_path / "out" / "report.html").read_text()
+    assert "state is unknown at every sample" in (tmp_path / "out" / "report.html").read_text()
     refused = call(config, "--estimator", "cem", "--out", tmp_path / "other")
     assert refused.exit_code == 2
     assert refused.stderr.count("\n") == 1
@@ -233,7 +234,7 @@ def test_a_log_outside_the_prior_is_a_doubt(tmp_path: Path, log: pd.DataFrame, m
     result = call(write_case(tmp_path, log), "--out", tmp_path / "out")
     assert "interval yet: " in result.stdout
     assert "warning: log log is unlike simulations of the prior" in " ".join(result.stdout.split())
-    assert strict_json((tmp_path / "out" / "result.json").read_text())["doubts"] == [outside.text]
+    assert strict_json((tmp_path / "out" / "result.json").read_text())["doubts"] == [outside.finding.text]
 
 
 @pytest.mark.usefixtures("unreported")
@@ -248,7 +249,7 @@ def test_a_log_that_the_model_follows_is_no_doubt(
     monkeypatch.setattr("sipe_bayes.calibration.checks.predictions.outside_prior", outside)
     found = strict_json(call(write_case(tmp_path, log), "--json", "--out", tmp_path / "out").stdout)
     assert found["doubts"] == []
-    assert "outside_prior_followed" in [item["code"] for item in found["findings"]]
+    assert ("outside_prior", "caution") in [(item["code"], item["severity"]) for item in found["findings"]]
 
 
 def test_what_the_model_lacks_is_a_warning(tmp_path: Path, log: pd.DataFrame) -> None:

@@ -16,7 +16,7 @@ from sipe_bayes.core.findings import Code, finding
 def test_what_a_run_found(tmp_path: Path) -> None:
     """With the run's own numbers, the worst first, each code once."""
     found = [
-        finding(Code.CHECKS_THINNED, windows=84, asked=67),
+        finding(Code.MISFIT_NOT_ASKED),
         finding(Code.NOISE_EXCEEDS_SCATTER, channel="q", ratio=12.34),
         finding(Code.NOISE_EXCEEDS_SCATTER, channel="q", ratio=5.0),
     ]
@@ -25,7 +25,7 @@ def test_what_a_run_found(tmp_path: Path) -> None:
     assert lines[0] == "noise_exceeds_scatter (blocking, 2 times, of which the first)"
     assert "12.3 times" in lines[1]
     assert lines[2].strip() == ADVICE[Code.NOISE_EXCEEDS_SCATTER]
-    assert lines[3].startswith("checks_thinned (note)")
+    assert lines[3].startswith("misfit_not_asked (note)")
 
 
 @pytest.mark.parametrize(

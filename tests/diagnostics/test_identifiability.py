@@ -7,7 +7,7 @@ import pytest
 
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges, worth_measuring
+from sipe_bayes.diagnostics.identifiability import dead_ranges, ridges
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.likelihood import Segments, bind
 from tests.problems.pendulums import log, pendulum
@@ -50,7 +50,7 @@ def test_a_member_that_is_determined_is_not_said_to_be_open() -> None:
     draws = np.stack([50 + 0.5 * (gear - 6) + 0.002 * rng.standard_normal(4000), gear], 1)
     contraction = 1 - draws.std(0) / np.array([100, 10]) * np.sqrt(12)
     (ridge,) = ridges(space, draws, contraction.tolist())
-    assert ridge.text.endswith("; gear alone is not")
+    assert "is determined; gear alone is not" in ridge.text
     assert set(ridge.parameters) == {"mass", "gear"}
 
 
@@ -128,27 +128,3 @@ def test_ridges_carry_units() -> None:
     (found,) = ridges(space, total, [0.3, 0.3])
     assert "N/kg" in found.text or "kg/N" in found.text, found.text
     assert found.text.split("±")[1].split(" is determined")[0].endswith((" N", " kg")), found.text
-
-
-def test_the_one_value_on_which_most_others_hang_is_named() -> None:
-    """A common scale of four, of which a mass comes before a gain; nothing where they are known, or apart."""
-    space = ParameterSpace(
-        Parameter(name, 0.1, 10.0, targets=(target,))
-        for name, target in [
-            ("gain", "actuator:motor.gain"),
-            ("load", "body:load.mass"),
-            ("friction", "joint:hinge.frictionloss"),
-            ("damping", "joint:hinge.damping"),
-            ("other", "joint:other.damping"),
-        ]
-    )
-    rng = np.random.default_rng(0)
-    scale, own = np.exp(0.5 * rng.standard_normal((4000, 1))), np.exp(0.02 * rng.standard_normal((4000, 5)))
-    draws = np.concatenate([scale * [1.0, 2.0, 0.3, 0.5], np.exp(0.5 * rng.standard_normal((4000, 1)))], axis=1) * own
-    open_ = [0.2] * 5
-    assert worth_measuring(space, draws, open_) == ("load", ("gain", "friction", "damping"))
-    assert worth_measuring(space, draws, [0.95] * 5) is None
-    assert worth_measuring(space, draws, [0.95, 0.2, 0.95, 0.2, 0.2]) is None  # one more is no reason
-    assert worth_measuring(space, np.exp(0.5 * rng.standard_normal((4000, 5))), open_) is None
-    loose = np.concatenate([scale * [1.0, 2.0, 0.3, 0.5], scale], axis=1) * np.exp(0.5 * rng.standard_normal((4000, 5)))
-    assert worth_measuring(space, loose, open_) is None  # they go together, but not so closely

@@ -7,8 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.diagnostics.coverage import FEWEST
-from sipe_bayes.diagnostics.sequential import clearly_wrong
+from sipe_bayes.diagnostics.coverage import FEWEST, clearly_wrong
 
 
 def ended(ranks: FloatArray) -> int | None:

@@ -16,20 +16,20 @@ from sipe_bayes.calibration.problem import prepare
 from sipe_bayes.cli.app import app
 from sipe_bayes.core.parameters import Parameter, ParameterSpace
 from sipe_bayes.core.trajectory import Trajectory
-from sipe_bayes.diagnostics.expected import Plan
-from sipe_bayes.diagnostics.suggest import KINDS, generate, limits, rank
+from sipe_bayes.diagnostics.suggest import KINDS, Plan, generate, information, limits, rank
+from sipe_bayes.diagnostics.suggest import contraction as expected
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference import get_estimator
 from sipe_bayes.likelihood import Noise, Segments
 from sipe_bayes.posterior import prior
 from sipe_bayes.simulation.simulator import Simulator
 from tests.problems.carts import GEARED
-from tests.problems.pendulums import DT, pendulum
+from tests.problems.pendulums import DT, log, pendulum
 
 BOUNDS = np.array([[-1.0, 1.0]])
 NOISE = Noise(np.array([0.01]), np.zeros(1))
 SEGMENTS = Segments(0.5, noise="white")
-TRUTH = np.array([0.6, 0.08])
+TRUTH, ANGLE = np.array([0.6, 0.08]), "joint:hinge.position"
 
 
 def contraction(simulator: Simulator, plan: Plan, seed: int) -> float:
@@ -60,6 +60,50 @@ def test_the_suggested_experiment_beats_random_ones() -> None:
     assert order > 0.7
 
 
+def test_what_is_expected_is_what_a_fit_finds() -> None:
+    """The same experiment again takes sds to 1 / sqrt 2 of what the first left."""
+    simulator = pendulum()
+    recorded = log(simulator, TRUTH.tolist(), 3)
+    posterior = get_estimator(simulator, "laplace", likelihood=SEGMENTS).fit(recorded)
+    (found,) = rank(simulator, SEGMENTS, [Plan(recorded.actions, DT)], NOISE, posterior, draws=2)
+    print(found.contraction)
+    np.testing.assert_allclose(list(found.contraction.values()), 1 - np.sqrt(0.5), atol=0.03)
+
+
+def test_a_plan_that_diverges_tells_nothing() -> None:
+    simulator = pendulum()
+    wild, still = Plan(np.full((100, 1), 1e9), DT, "wild"), Plan(np.zeros((100, 1)), DT, "still")
+    found = {
+        one.plan.name: one for one in rank(simulator, SEGMENTS, [wild, still], NOISE, prior(simulator.space), draws=2)
+    }
+    assert (found["wild"].diverged, found["wild"].score) == (2, 0.0)
+    assert found["still"].diverged == 0
+
+
+def test_a_new_log_has_nuisances_of_its_own() -> None:
+    """Zero errors of two old logs.
+
+    The plan says nothing of them, and of the rest what it says where its own zero error is unknown. A mass at one place
+    and a zero of 0.3 rad do much the same to a pendulum that hardly moves, so that this is not what it says with a
+    known zero.
+    """
+    bias = ("sensor:joint:hinge.position.bias",)
+    old = [Parameter(f"zero[{log}]", -0.3, 0.3, targets=bias, log=log) for log in ("a", "b")]
+    plan = Plan(0.5 * np.sin(0.05 * np.arange(300))[:, None], DT)
+    gains = []
+    for more in ((), (Parameter("zero", -0.3, 0.3, targets=bias),), old):
+        simulator = pendulum(*more)
+        at = np.full(len(simulator.space), 0.5)
+        told = information(simulator, SEGMENTS, plan, NOISE, at)
+        assert told is not None
+        gains.append(expected(12 * np.eye(len(told)), [told]))
+    without, own, logs = gains
+    print(without, own, logs)
+    np.testing.assert_allclose(logs[:2], own[:2], rtol=1e-4)
+    np.testing.assert_allclose(logs[2:], 0, atol=1e-9)
+    assert (without > own[:2] + 1e-6).any()
+
+
 def test_what_takes_the_machine_far_beyond_its_logs_comes_last() -> None:
     """Whatever it tells: the small ones stay within what a small one reached, the large ones do not."""
     simulator = pendulum()
@@ -67,7 +111,7 @@ def test_what_takes_the_machine_far_beyond_its_logs_comes_last() -> None:
     known = simulator, SEGMENTS, plans, NOISE, prior(simulator.space)
     plain = rank(*known, draws=2)
     assert not any(one.strays for one in plain)
-    near = min(plain, key=lambda one: float(np.ptp(one.reach, axis=1)[0])).reach
+    near = np.array([min((one.reach[ANGLE] for one in plain), key=np.ptp)])
     ranked = rank(*known, reached=near, draws=2)
     strays = [bool(one.strays) for one in ranked]
     assert 0 < sum(strays) < len(strays)
@@ -75,8 +119,8 @@ def test_what_takes_the_machine_far_beyond_its_logs_comes_last() -> None:
     assert [bool(x) for x in last] == sorted(bool(x) for x in last)
     assert not ranked[0].strays
     for one in ranked:
-        beyond = max(near[0, 0] - one.reach[0, 0], one.reach[0, 1] - near[0, 1])
-        assert (one.strays == (0,)) == (beyond > 0.5 * float(np.ptp(near, axis=1)[0]))
+        beyond = max(near[0, 0] - one.reach[ANGLE][0], one.reach[ANGLE][1] - near[0, 1])
+        assert (one.strays == (ANGLE,)) == (beyond > 0.5 * float(np.ptp(near, axis=1)[0]))
 
 
 def test_a_narrow_band_holds_every_kind() -> None:
@@ -92,7 +136,7 @@ def test_the_parameters_asked_for_decide() -> None:
     plans = generate(4, 2.0, DT, BOUNDS, (0.5, 5.0))
     found = rank(simulator, SEGMENTS, plans, NOISE, prior(simulator.space), ["damping"], draws=2)
     for one in found:
-        assert one.score == pytest.approx(one.contraction[1])
+        assert one.score == pytest.approx(one.contraction["damping"])
     assert [one.score for one in found] == sorted((one.score for one in found), reverse=True)
     with pytest.raises(ValueError, match="no parameter 'mass'; there are rod_mass, damping"):
         rank(simulator, SEGMENTS, plans, NOISE, prior(simulator.space), ["mass"])
@@ -135,8 +179,9 @@ def test_a_parameter_of_one_log_is_not_asked_for() -> None:
     with pytest.raises(ValueError, match=r"names: 'zero\[a\]' is of a log that is there already"):
         rank(simulator, SEGMENTS, plans, NOISE, prior(simulator.space), ["zero[a]"])
     (found,) = rank(simulator, SEGMENTS, plans, NOISE, prior(simulator.space), draws=2)
-    assert found.score == pytest.approx(found.contraction[:2].mean())
-    assert found.contraction[2] == pytest.approx(0, abs=1e-9)
+    *own, zero = found.contraction.values()
+    assert found.score == pytest.approx(np.mean(own))
+    assert zero == pytest.approx(0, abs=1e-9)
 
 
 def test_a_posterior_with_other_bounds_is_refused(config: Path, tmp_path: Path) -> None:

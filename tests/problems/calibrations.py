@@ -14,7 +14,6 @@ from sipe_bayes.diagnostics.records import (
     Comparison,
     LogReport,
     Misfit,
-    Mixing,
     Residual,
     Ridge,
     Signal,
@@ -119,8 +118,7 @@ def make_calibration(size: int = 3, logs: int = 1, channels: int = 1, names: tup
 def with_chains(calibration: Calibration, rhat: float) -> Calibration:
     theta = calibration.posterior.sample((400,), torch.Generator().manual_seed(0))
     posterior = Particles(theta, calibration.posterior.space, chains=4)
-    names = posterior.space.names
-    mixing = Mixing.of({"rhat": dict.fromkeys(names, rhat), "ess": [321.0] * len(names), "acceptance": 0.31}, names)
+    mixing = {"rhat": rhat, "ess": 321.0, "acceptance": 0.31}
     return dataclasses.replace(calibration, posterior=posterior, mixing=mixing)
 
 

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, settings
 from sipe_bayes.calibration.config import Config, load_config
 from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.core.trajectory import Trajectory
-from sipe_bayes.diagnostics.records import LogReport
+from sipe_bayes.diagnostics.records import LogReport, plain
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 QUIET = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -69,7 +69,7 @@ def load(
         write(folder / file, columns)
     config = configure(folder, file, **words)
     trajectory, report = load_log(config, config.logs[0])
-    json.dumps(report.to_dict(), allow_nan=False)
+    json.dumps(plain(report), allow_nan=False)
     return trajectory, report
 
 

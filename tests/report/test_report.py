@@ -219,7 +219,7 @@ def test_chains_have_one_row_per_parameter(calibration: Calibration) -> None:
     assert plots.chains(calibration) == []
     (figure,) = plots.chains(with_chains(calibration, 1.003))
     assert [len(ax.lines) for ax in figure.axes] == [4, 4, 4]
-    assert figure.axes[0].get_title(loc="left") == "p0, R-hat 1.003, effective draws 321"
+    assert figure.axes[0].get_title(loc="left") == "p0"
 
 
 def test_figures_are_the_same_bytes_each_time(calibration: Calibration) -> None:

@@ -58,8 +58,6 @@ def of_mass(*codes: Code) -> Findings:
         (parameter(0.99), (Code.MODE_AT_BOUND,), "bad", "at a bound"),
         (parameter(0.0), (Code.NO_EFFECT, Code.NOT_DETERMINED), "bad", "changes nothing, not determined"),
         (parameter(0.99), (Code.LOGS_DISAGREE,), "bad", "disagrees between logs"),
-        (parameter(0.99), (Code.LOGS_DISAGREE_UNEXPLAINED,), "bad", "disagrees between logs"),
-        (parameter(0.99), (Code.MISFIT_SHIFTS,), "bad", "model lacks something"),
         (parameter(0.99), (Code.MODE_AT_BOUND, Code.MISFIT), "bad", "at a bound, model lacks something"),
         (parameter(0.99), (Code.AT_PHYSICAL_BOUND,), "good", "none shows"),
         (parameter(0.99), (Code.AT_PHYSICAL_BOUND, Code.MISFIT), "bad", "model lacks something"),
@@ -82,7 +80,7 @@ def test_verdict_on_a_parameter(summary: ParameterSummary, codes: tuple[Code, ..
 
 def test_a_member_of_a_ridge_is_determined_only_with_the_others() -> None:
     def seen(contraction: float, *codes: Code, members: tuple[str, ...] = ("mass", "length")) -> judged.Verdict:
-        findings = [noticed(Code.RIDGE_TO_RESOLVE, *members), *of_mass(*codes)]
+        findings = [noticed(Code.RIDGE, *members), *of_mass(*codes)]
         return judged.parameter_verdict(parameter(contraction), Findings(findings))
 
     for codes in ((), (Code.NOT_DETERMINED,)):

@@ -16,12 +16,13 @@ from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.core.findings import Code, Finding, finding
 from sipe_bayes.core.telling import Tell
 from sipe_bayes.core.trajectory import Trajectories
-from sipe_bayes.diagnostics.agreement import LogEstimates, linear_estimates, log_estimates
+from sipe_bayes.diagnostics.agreement import linear_estimates
 from sipe_bayes.diagnostics.evaluate import LOOKED_AT, channel_noise, white_noise
 from sipe_bayes.diagnostics.records import ChannelNoise, LogReport
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.likelihood import BoundLikelihood, Linearisation, Noise, StateSpace, bind
-from sipe_bayes.structure.discrepancy import parts_of
+from sipe_bayes.structure.augmented import AugmentedModel, DivergesError
+from sipe_bayes.structure.discrepancy import LogEstimate
 
 
 def from_fitted_states(problem: Problem, method: Estimator) -> Problem:
@@ -124,24 +125,29 @@ def _noise_of(method: Estimator, windows: BoundLikelihood, theta: FloatArray) ->
     return white_noise(windows, theta)
 
 
-def one_by_one(problem: Problem, fit: Fit, seed: int, checks: Checks) -> LogEstimates:
-    """What each of several logs says by itself.
+def one_by_one(problem: Problem, fit: Fit, checks: Checks) -> list[LogEstimate]:
+    """What each of several logs says by itself, to first order; nothing where the simulation diverges.
 
-    To first order where a linearisation is at hand, else by a fit of each. Not asked of bodies that tumble: one log
-    says too little of them by itself, and its scatter is in the posterior.
+    With a ``StateSpace``, whose process noise takes what the model lacks, it is asked of windows from the fitted
+    states, beside noise as large and as correlated as their residuals. Not asked of bodies that tumble: one log says
+    too little of them by itself, and its scatter is in the posterior.
     """
 
-    def made(tell: Tell, kept: Kept) -> LogEstimates:
-        if fit.windows.impacts:
-            return LogEstimates()
-        if fit.lin is not None and fit.lin.valid:
-            part, starts = fit.windows.part(fit.some), fit.starts[fit.some]
-            noise, memory = fit.noise, None
-            if fit.least_squares:
-                share = np.exp(-float(part.dt.min()) / np.maximum(noise.tau, 1e-12))
-                noise, memory = Noise(noise.sd, np.zeros_like(noise.tau)), (1 + share) / (1 - share)
-            alone = linear_estimates(part, fit.theta, starts, noise, fit.lin, parts_of(part), memory)
-            return LogEstimates(tuple(alone))
-        return log_estimates(problem.simulator, problem.likelihood, problem.train, fit.theta, seed, tell, kept)
+    def made(tell: Tell, kept: Kept) -> list[LogEstimate]:
+        part, starts, noise = fit.windows.part(fit.some), fit.starts[fit.some], fit.noise
+        if fit.windows.impacts or len(problem.train) < 2:
+            return []
+        chain = isinstance(problem.likelihood, StateSpace)
+        if chain:
+            noise = white_noise(part, fit.theta)
+        elif fit.least_squares:  # white noise, of which as many samples tell as much
+            share = np.exp(-float(part.dt.min()) / np.maximum(noise.tau, 1e-12))
+            noise = Noise(noise.sd * np.sqrt((1 + share) / (1 - share)), np.zeros_like(noise.tau))
+        try:
+            seen = AugmentedModel(part, fit.theta, noise, starts, lin=fit.lin, placed=()).seen
+        except DivergesError:
+            nothing = np.zeros((len(fit.theta), len(fit.theta)))
+            return [LogEstimate(name, fit.theta, nothing) for name in problem.train.names]
+        return linear_estimates(seen.discounted if chain else seen)
 
-    return checks.of(Check.LOGS, LogEstimates, made)
+    return checks.of(Check.LOGS, list[LogEstimate], made)

@@ -112,9 +112,6 @@ def _found(problem: Problem, fit: Fit, unknown: list[Finding], tell: Tell, kept:
     windows, starts, prior = fit.windows.part(some), fit.starts[some], QuadraticPrior.of(problem.prior)
     try:
         logs = AugmentedModel(windows, fit.theta, fit.noise, starts, prior, lin, tell, kept)
-        if logs.windows.num_windows < fit.windows.num_windows:
-            asked, every = logs.windows.num_windows, fit.windows.num_windows
-            unknown.append(finding(Code.CHECKS_THINNED, asked=asked, windows=every))
         tell("which extensions explain the residuals")
         found = find_discrepancy(logs, problem.tolerances)
         unknown.extend(untold(found))

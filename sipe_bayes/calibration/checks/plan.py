@@ -12,10 +12,10 @@ import numpy as np
 from sipe_bayes.calibration.problem import Problem
 from sipe_bayes.core.checkpoint import Kept
 from sipe_bayes.core.telling import Tell
-from sipe_bayes.diagnostics.agreement import LOG_BUDGET
-from sipe_bayes.diagnostics.evaluate import LOOKED_AT, band_cost, starts_cost
+from sipe_bayes.diagnostics.bands import DRAWS
+from sipe_bayes.diagnostics.evaluate import LOOKED_AT
 from sipe_bayes.diagnostics.identifiability import GRID
-from sipe_bayes.diagnostics.prior_predictive import PREDICTIVE
+from sipe_bayes.diagnostics.prior_predictive import SIMULATIONS, STEPS
 from sipe_bayes.inference.base import Estimator
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood import StateSpace, bind
@@ -113,21 +113,20 @@ def plan_of(problem: Problem, method: Estimator) -> Plan:
         """Of the windows that a check looks at, so many control steps at most."""
         return min(1.0, most / steps)
 
-    search = starts_cost(windows)
+    search = windows.starts_cost * logs
     try:
         placed = [] if chain else place_extensions(windows, theta, windows.no_starts())
         lacking = round(probes_cost(windows, placed) * share(steps_of(windows, placed)))
     except ValueError:  # the model as given diverges, which the check will say
         lacking = 0
-    alone = min(30 * (n + windows.num_start + 2) + 600, LOG_BUDGET) * logs
     return {
         Check.STARTS: 0 if known else 2 * search,
-        Check.LOGS: (alone if chain else round(lin * share(LOOKED_AT))) if logs > 1 and not windows.impacts else 0,
+        Check.LOGS: round((lin + chain * search) * share(LOOKED_AT)) if logs > 1 and not windows.impacts else 0,
         Check.LACKING: 0 if chain else lacking + logs,
         Check.PREDICTIONS: 2 * (logs + held),
-        Check.COMPARISON: round(search * share(LOOKED_AT) * (logs + held)) // logs,
-        Check.PRIOR: round(PREDICTIVE.simulations * logs * share(PREDICTIVE.steps)),
-        Check.BANDS: band_cost(windows) * (logs + held) // logs,
+        Check.COMPARISON: round(search * share(LOOKED_AT) * (logs + held)) // logs + 2 * held,
+        Check.PRIOR: round(SIMULATIONS * logs * share(STEPS)),
+        Check.BANDS: DRAWS * (logs + held),
         Check.RANGES: round(len(GRID) * n * logs * share(LOOKED_AT)),
     }
 

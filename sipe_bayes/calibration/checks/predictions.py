@@ -70,8 +70,7 @@ class Predictions:
             comparison = None
             if "holdout" in self.windows:
                 tell("held-out logs")
-                held, predicted = self.windows["holdout"], self.predicted["holdout"]
-                comparison = compare_errors(held, self.theta, predicted=predicted)
+                comparison = compare_errors(self.windows["holdout"], self.theta)
             tell("training logs")
             return Compared(comparison, tuple(worse_in_training(self.windows["train"], self.theta, self.train)))
 

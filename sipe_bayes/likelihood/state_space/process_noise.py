@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray, IntArray
-from sipe_bayes.core.findings import Code, Finding, finding
+from sipe_bayes.core.findings import Code, Finding, Severity, finding
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.likelihood.state_space.chain import Chain
 
@@ -23,8 +23,15 @@ def process_noise_findings(
     share = np.where(chain.irrelevant, 0.0, process / movement)
     worst = int(share.argmax())
     percent = f"{100 * share[worst]:.0f}" if share[worst] > 0.1 else f"{100 * share[worst]:.2g}"
+    much = share[worst] >= THRESHOLDS.much_process_noise
+    large = (
+        " A model that lacks nothing needs next to none. Either this one lacks something there, or measurement noise "
+        "hides how stiff the contact is: then estimates may be off by several posterior sds"
+    )
     largest = finding(
         Code.PROCESS_NOISE,
+        severity=Severity.CAUTION if much else None,
+        meaning=large if much else "",
         coordinate=chain.labels[worst],
         sd=float(process[worst]),
         percent=percent,
@@ -32,8 +39,7 @@ def process_noise_findings(
         steps=int(chain.linked.sum()),
         times=f": at {_times(chain, outliers)}" if len(outliers) else "",
     )
-    much = share[worst] >= THRESHOLDS.much_process_noise
-    return [largest, finding(Code.PROCESS_NOISE_LARGE)] if much else [largest]
+    return [largest]
 
 
 def _times(chain: Chain, outliers: Sequence[int] | IntArray) -> str:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sipe_bayes.core.findings import Code
+from sipe_bayes.core.findings import Code, Severity
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.laplace import estimator
 from sipe_bayes.inference.laplace.estimator import Laplace
@@ -122,7 +122,8 @@ def test_process_noise_says_where_the_model_lacks_something() -> None:
         findings[name] = process_noise_findings(chain, *noise)
     print(findings)
     assert [item.code for item in findings["right"]] == [Code.PROCESS_NOISE]
-    assert [item.code for item in findings["wrong"]] == [Code.PROCESS_NOISE, Code.PROCESS_NOISE_LARGE]
+    assert [item.code for item in findings["wrong"]] == [Code.PROCESS_NOISE]
+    assert [findings[name][0].severity for name in ("right", "wrong")] == [Severity.NOTE, Severity.CAUTION]
     assert "of hinge" in findings["wrong"][0].text
 
 
