@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from sipe_bayes.cli.errors import command_line, exit_on_error
+from sipe_bayes.core.files import was_interruption
 from sipe_bayes.inference.progress_bar import ProgressBar
 
 
@@ -27,8 +28,7 @@ def init(
     with exit_on_error():
         if model is None or not logs:
             raise ValueError("expected a model and at least one log: sipe init MODEL.xml LOG...")
-        if out.exists() and not force:
-            raise ValueError(f"--out {out}: exists already; give --force to overwrite it, or another name")
+        _check_paths(model, out, force)
         from sipe_bayes.calibration.init.asking import asked
         from sipe_bayes.calibration.init.propose import propose
         from sipe_bayes.calibration.init.write import plot_columns, summary, toml_of
@@ -46,12 +46,36 @@ def init(
         print(line)
 
 
+def _check_paths(model: Path, out: Path, force: bool) -> None:
+    """Raise ValueError for a log in place of the model, and for a file that cannot be written or must not be."""
+    from sipe_bayes.calibration.readers.tables import READERS
+
+    if model.is_dir() or (model.is_file() and model.suffix.lower() in READERS):
+        raise ValueError(f"{model}: is a log, and the model comes first; exchange them: sipe init MODEL.xml LOG...")
+    if out.is_dir():
+        raise ValueError(f"--out {out}: is a folder; give the name of a file: --out {out / 'calibrate.toml'}")
+    if not out.parent.exists():
+        raise ValueError(f"--out {out}: the folder {str(out.parent)!r} does not exist; make it, or give another name")
+    if out.exists() and not force:
+        raise ValueError(f"--out {out}: exists already; give --force to overwrite it, or another name")
+
+
 def _ask(text: str, answers: Sequence[str]) -> int:
-    """Show a question on the terminal; Enter takes the first answer."""
+    """Show a question on the terminal; Enter takes the first answer.
+
+    Raises:
+        ValueError: the input ended.
+    """
     print(f"{text}")
     for k, answer in enumerate(answers, 1):
         print(f"  {k}) {answer}")
     while True:
-        given: int = typer.prompt("which", default=1, type=int)
+        try:
+            given: int = typer.prompt("which", default=1, type=int)
+        except typer.Abort as abort:
+            if was_interruption(abort):
+                raise
+            raise ValueError("no answer: the input ended, nothing is written; --yes keeps what is proposed") from None
         if 1 <= given <= len(answers):
             return given - 1
+        print(f"expected a number from 1 to {len(answers)}, got {given}")

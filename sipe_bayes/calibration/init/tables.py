@@ -141,6 +141,11 @@ def _find_clock(path: Path, numbers: Mapping[str, FloatArray]) -> Clock:
         steps = np.diff(values)
         if _increases(values) and np.mean(np.abs(steps - np.median(steps)) > 0.5 * np.median(steps)) < 0.3:
             return _make_clock(leaf(name), values, f"the only kind of column that rises steadily: {name}")
+    for name, values in times.items():
+        if len(falls := np.flatnonzero(np.diff(values) < 0)):
+            at = f"first in row {falls[0] + 3} from {values[falls[0]]:.10g} to {values[falls[0] + 1]:.10g}"
+            remedy = "sort the rows, make each part a file of its own, or give their Hz: --rate 500"
+            raise LogError(f"{path}: the clock {name!r} goes back {len(falls)} times, {at}; {remedy}")
     has = listed(list(map(repr, numbers)))
     raise LogError(f"{path}: no column is a clock that increases; it has {has}; give the rows' Hz: --rate 500")
 

@@ -18,6 +18,7 @@ from sipe_bayes.calibration.readers.base import Columns, LogError, check_size, f
 
 _LONGEST = 2**17  # characters of a header or a name: what the csv module takes
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:")
+_NAMED = "the file names its columns itself: drop --columns (`columns.names`)"
 _REMARKS = 200  # lines above the header that are looked through
 
 
@@ -35,8 +36,9 @@ def read_csv(path: Path, wanted: Collection[str], given: Sequence[str] = ()) -> 
     if given:
         above, first = (above, first) if header.lstrip()[:1] in ("#", "%") else (above - 1, header)
         if not _is_row(first) or _width(first) != len(given):
-            is_given = f"{len(given)} names are given for a table without a header"
-            raise LogError(f"{path}: {is_given}, its first row is {first[:40]!r}; correct `columns.names`, or drop it")
+            shown = f"its first row is {first[:40]!r}"
+            remedy = f"it has {_width(first)}: correct --columns (`columns.names`)" if _is_row(first) else _NAMED
+            raise LogError(f"{path}: {len(given)} names are given for a table without a header, {shown}; {remedy}")
         separator, names = _separator(first), list(given)
     elif any(_is_number(name) for name in names):
         raise LogError(

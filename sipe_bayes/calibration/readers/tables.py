@@ -105,6 +105,8 @@ def _kind(path: Path) -> str:
     if path.suffix.lower() not in READERS:
         suffixes = _one_of(kind for kind in READERS if kind.startswith("."))
         raise LogError(f"{path}: expected a {suffixes} file, got {path.suffix!r}; convert it")
+    if not path.stat().st_size:
+        raise LogError(f"{path}: holds no samples, the file is empty; record the log again or drop it")
     return path.suffix.lower()
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 
 from sipe_bayes.core.files import LineError, is_file
+from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.envs.foreign.quiet import quiet
 from sipe_bayes.envs.foreign.trial import refusal
 from sipe_bayes.envs.foreign.urdf import parsed
@@ -29,7 +30,8 @@ def load_spec(source: str) -> mujoco.MjSpec:
     """
     text = source.lstrip().startswith("<")
     if not text and not is_file(source):
-        raise ModelError(f"model: no file {source!r}; give the path of an MJCF file, or the MJCF text itself")
+        near = nearest_name(Path(source).name, _beside(Path(source)), 0.8)
+        raise ModelError(f"model: no file {source!r}; give the path of an MJCF file, or the MJCF text itself{near}")
     why = "" if text else refusal(Path(source))
     if why:
         raise ModelError(f"model: {source} {why}")
@@ -51,6 +53,11 @@ def compile_spec(spec: mujoco.MjSpec, source: str) -> mujoco.MjModel:
         expected = f"expected a timestep of at least {LEAST_TIMESTEP:g} s"
         raise ModelError(f"model: {_where(source)}: {expected}, got {model.opt.timestep:g}; correct <option timestep>")
     return model
+
+
+def _beside(path: Path) -> list[str]:
+    """Names of the models in the folder of a path."""
+    return [entry.name for kind in ("*.xml", "*.urdf", "*.mjcf") for entry in sorted(path.parent.glob(kind))]
 
 
 def _where(source: str) -> str:
