@@ -1,4 +1,4 @@
-"""Logs of every format, each written by its own library; ULog, which has no writer, by hand."""
+"""Logs of every format, each by its own library; by hand MATLAB 7.3 on HDF5, LeRobot on Parquet, ULog before pyulog."""
 
 import json
 import shutil
@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
+from pyulog import ULog
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.io import savemat
@@ -210,6 +211,7 @@ def ulog_file(folder: Path, table: Table) -> Written:
         parts.append(record("D", struct.pack("<HQf4xdd", 0, time, 0.25, 0.0, q)))
         parts += [record("D", struct.pack("<HQd", i, time, value)) for i, value in ((1, 0.0), (2, u))]
     (folder / "log.ulg").write_bytes(b"".join(parts))
+    ULog(str(folder / "log.ulg")).write_ulog(str(folder / "log.ulg"))
     return Written(folder / "log.ulg", {"t": "time", "q": "joint.angle[1]", "u": "motor[1].effort"})
 
 

@@ -1,17 +1,19 @@
 """Lists in the cells of a CSV, folders that are one log and JSON: what their columns are called and hold."""
 
 import json
+import pickle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.io import savemat
 
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.readers.base import LogError
 from sipe_bayes.calibration.readers.joined import JOINTS
-from sipe_bayes.calibration.readers.tables import read_table
+from sipe_bayes.calibration.readers.tables import READERS, read_table
 from tests.calibration.readers.files import joined_folder
 from tests.problems.log_tables import regular
 
@@ -74,10 +76,35 @@ def test_a_folder_of_motions_is_matched_by_the_order_of_its_joints(tmp_path: Pat
     assert [log.file for log in draft.logs] == ["raw/one", "raw/two"]
 
 
-def test_a_pickle_is_not_loaded(tmp_path: Path) -> None:
-    (tmp_path / "x.pt").write_bytes(b"")
-    with pytest.raises(LogError, match=r"x.pt: is a pickle, which .* where it was made: `numpy.savez"):
-        read_table(tmp_path / "x.pt")
+class Runs:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return Path.touch, (self.path,)
+
+
+def test_no_pickle_is_loaded(tmp_path: Path) -> None:
+    harm, data = Runs(tmp_path / "ran"), {"t": np.arange(3.0)}
+    for kind in (".pt", ".pth", ".pkl", ".pickle"):
+        (tmp_path / f"x{kind}").write_bytes(pickle.dumps(harm))
+        with pytest.raises(LogError, match=rf"x{kind}: is a pickle, which .* where it was made: `numpy.savez"):
+            read_table(tmp_path / f"x{kind}")
+    for kind in (kind for kind in READERS if kind.startswith(".")):
+        (tmp_path / f"x{kind}").write_bytes(pickle.dumps(harm))
+        with pytest.raises(LogError):
+            read_table(tmp_path / f"x{kind}")
+    np.savez(tmp_path / "x.npz", **data, q=np.array([harm, harm, harm]))
+    with pytest.raises(LogError, match="array 'q' holds Python objects"):
+        read_table(tmp_path / "x.npz")
+    frame = pd.DataFrame({**data, "q": [pickle.dumps(harm)] * 3})
+    frame.to_parquet(tmp_path / "x.parquet")
+    assert read_table(tmp_path / "x.parquet")["t"].tolist() == [0, 1, 2]
+    assert not (tmp_path / "ran").exists()
+    assert pickle.loads(pickle.dumps(harm)) is None  # noqa: S301, that it would have
+    assert (tmp_path / "ran").exists()
 
 
 @pytest.mark.parametrize(
