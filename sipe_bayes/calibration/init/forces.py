@@ -12,6 +12,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import scipy.optimize
 from scipy.ndimage import gaussian_filter1d
 
 from sipe_bayes.calibration.init.cases import Source, case_of, loaded
@@ -49,9 +50,9 @@ def with_forces(
     if not known:
         return draft, notes
     regression = case_of(draft, model, machine, sources, folder).regression
-    outcome, motion = regression.fit(regression.given), regression.given_motion
-    damping = regression.simulator.model.dof_damping
-    seen = motion.asked + damping * motion.speed + outcome.friction * turning_of(motion.speed)
+    motion = regression.given_motion
+    accelerations = motion.states[:, model.nq + model.nv : model.nq + 2 * model.nv]
+    resisting = np.stack([motion.speed, turning_of(motion.speed), accelerations], axis=-1)
     place = sum(len(m.channels) for m in draft.config(folder).measurements)
     whole = loaded(replace(draft, measurements=(*draft.measurements, *first)), sources, folder)
     parts = zip(whole, regression.logs, regression.widths, regression.rows, strict=True)
@@ -60,7 +61,8 @@ def with_forces(
     sizes = len(first) > 1 and not (measured < 0).any()
     readings = []
     for reading, values in zip(first, measured.T, strict=True):
-        force = seen[:, int(model.joint(_find_joint(reading)).dofadr[0])]
+        dof = int(model.joint(_find_joint(reading)).dofadr[0])
+        force = _add_resistance(motion.asked[:, dof], resisting[:, dof], values)
         both_ways = min(np.mean(force > 0), np.mean(force < 0)) > _BOTH_WAYS
         if (both_ways or sizes) and not (values < 0).any():
             notes.append(f"{reading.match.column!r} is not used: it never changes its sign")
@@ -69,6 +71,19 @@ def with_forces(
         readings += [decided] if decided.fit else []
         notes += [] if decided.fit else [f"{reading.match.column!r} is not used: {note}" for note in decided.notes]
     return replace(draft, measurements=(*draft.measurements, *readings)), notes
+
+
+def _add_resistance(asked: FloatArray, resisting: FloatArray, measured: FloatArray) -> FloatArray:
+    """The force (n,) of a drive: what the model asks for (n,), and what resists it (n, 3) as the measured one says.
+
+    That is viscous and dry friction and the inertia of a rotor, of which the model may have other ones or none.
+    """
+    known = np.isfinite(measured)
+    design = np.column_stack([measured, np.ones(len(measured)), -resisting])[known]
+    scale = np.sqrt((design**2).mean(axis=0)) + 1e-12
+    least = np.array([-np.inf, -np.inf, 0.0, 0.0, 0.0])
+    found = scipy.optimize.lsq_linear(design / scale, asked[known], (least, np.inf)).x / scale
+    return np.asarray(asked + resisting @ found[2:])
 
 
 def _decide(reading: Reading, force: FloatArray, measured: FloatArray) -> Reading:

@@ -22,9 +22,11 @@ ARM = """<mujoco><option timestep="0.004" integrator="implicitfast"/><worldbody>
   <position name="elbow_servo" joint="elbow" kp="20" kv=".5"/></actuator></mujoco>"""
 
 
-def proposed(folder: Path, scales: dict[str, float], name: str = "effort_{}") -> Draft:
+def proposed(folder: Path, scales: dict[str, float], name: str = "effort_{}", rotor: float = 0.0) -> Draft:
     """For a servo arm whose log has the forces of its servos, times the scales, beside positions and set-points."""
     model = mujoco.MjModel.from_xml_string(ARM.format(damping=0.2, mass=0.9, kp=50))
+    model.dof_armature[:] = rotor
+    model.dof_frictionloss[:] = 4 * rotor
     data, rows, noise = mujoco.MjData(model), [], np.random.default_rng(0)
     for k in range(500):
         t = 0.012 * k
@@ -53,6 +55,15 @@ def test_efforts_are_measured_with_their_sign_and_unit_and_make_forces_known(tmp
     assert not any("no force is known" in doubt for doubt in draft.doubts)
     assert {"upper_mass", "lower_mass"} <= {unknown.name for unknown in draft.free}
     assert draft.config(tmp_path)
+
+
+def test_efforts_that_move_rotors_and_overcome_friction_that_the_model_lacks_are_known_forces(tmp_path: Path) -> None:
+    draft = proposed(tmp_path, {"shoulder": 1.0, "elbow": 1.0}, rotor=0.1)
+    forces = [r for r in draft.measurements if r.match.target.endswith(".force")]
+    print([(r.unit, r.notes, r.doubts) for r in forces])
+    assert all(r.unit == "N m" and not r.doubts for r in forces)
+    assert all("explains 9" in note or "explains 100" in note for r in forces for note in r.notes)
+    assert {"upper_mass", "lower_mass"} <= {unknown.name for unknown in draft.proposed}
 
 
 @pytest.mark.parametrize(
