@@ -13,11 +13,13 @@ Both run as commands, with their time taken. What is compared:
 
 Parameters that stay fixed may change what the others have to be: the damping of a joint is a part of its servo's
 velocity gain, forces that no log knows are relative to the masses. ``equivalent`` holds the values with which a model
-of the machine, but for nominal masses and these dampings, accelerates as the machine does, within 5 % (RMS); where
-there are none, the truth, but for the error of such a damping in the velocity gain.
+of the machine accelerates as the machine does, within 5 % (RMS), though such dampings are nominal, and what the file
+of `sipe init` leaves out for it "shows as" others or is what forces are relative to. Where there are no such values,
+it is the truth, but for the error of such a damping in the velocity gain.
 
     python examples/studies/init_then_calibrate.py                       # all machines: ten minutes of one core
     python examples/studies/init_then_calibrate.py --machines conveyor --seed 1
+    python examples/studies/init_then_calibrate.py --judge               # compares kept fits with the truth again
 
 Machines are kept one by one in runs/init_then_calibrate.jsonl, their files in runs/init_then_calibrate.
 Results: results/init_then_calibrate.json
@@ -231,9 +233,14 @@ def table(machine: Machine, seen: Sequence[Mapping[str, FloatArray]], rng: np.ra
     return pd.DataFrame(out)
 
 
-def prepared(name: str, seed: int) -> tuple[Path, dict[str, float]]:
-    """The folder of a machine with its model and logs, and its true numbers."""
-    machine, rng = MACHINES[name], np.random.default_rng([zlib.crc32(name.encode()), seed])
+def generator(name: str, seed: int) -> np.random.Generator:
+    """Of which the first numbers are the machine's."""
+    return np.random.default_rng([zlib.crc32(name.encode()), seed])
+
+
+def prepared(name: str, seed: int) -> Path:
+    """The folder of a machine with its model and logs."""
+    machine, rng = MACHINES[name], generator(name, seed)
     folder = FOLDERS / f"{name}-{seed}"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -246,7 +253,7 @@ def prepared(name: str, seed: int) -> tuple[Path, dict[str, float]]:
             rows.to_csv(folder / f"{log}.csv", index=False, float_format="%.7g")
         else:
             np.savez(folder / f"{log}.npz", **{column: rows[column].to_numpy() for column in rows})
-    return folder, numbers
+    return folder
 
 
 def command(folder: Path, *arguments: str) -> dict[str, Any]:
@@ -348,9 +355,12 @@ def find_equivalent(folder: Path, machine: Machine, numbers: Mapping[str, float]
 
     Gauss-Newton steps on the accelerations at samples of the first log, from the truth, of least length.
     """
-    true, beside = machine.compiled(numbers), {f"d_{joint}" for one in free if (joint := one.slowed_joint)}
-    fixed_ones = {n: x for n, x in machine.nominal().items() if n in beside or n.startswith(("m_", "mass"))}
-    base, moving = machine.compiled({**numbers, **fixed_ones}), [f for f in free if f.dynamic and f.truth]
+    true, nominal = machine.compiled(numbers), machine.nominal()
+    text = (folder / "calibrate.toml").read_text()
+    said = re.findall(r'# left out: (?:no force is known|shows as)[^\[]*\[\[.*\n# name.*\n# target = "(.*)"', text)
+    beside = {f"d_{joint}" for one in free if (joint := one.slowed_joint)} | set(changing(machine, numbers, said))
+    base = machine.compiled({**numbers, **{name: nominal[name] for name in beside}})
+    moving = [f for f in free if f.dynamic and f.truth]
     for one in free:
         one.equivalent = None if one.truth is None else sum(one.truth) / 2 + _damping_beside(one, free, base, true)
     samples = np.load(folder / "samples.npz")
@@ -433,14 +443,17 @@ def _rounded(value: Any) -> Any:
     return [_rounded(x) for x in value] if isinstance(value, (list, tuple)) else value
 
 
+def changing(machine: Machine, numbers: Mapping[str, float], targets: Sequence[str]) -> list[str]:
+    """The numbers of a machine that change one of these targets."""
+    nominal = machine.nominal()
+    base, others = machine.compiled(nominal), {n: machine.compiled({**nominal, n: x}) for n, x in numbers.items()}
+    return [n for n, other in others.items() if any(_differs(base, other, target) for target in targets)]
+
+
 def fixed(machine: Machine, numbers: Mapping[str, float], free: Sequence[str]) -> list[str]:
-    """What the truth changes and no free parameter can follow: by the nominal model with one number true."""
-    nominal, out = machine.nominal(), []
-    base = machine.compiled(nominal)
-    for name, (own, _, _) in machine.numbers.items():
-        other = machine.compiled({**nominal, name: numbers[name]})
-        if not any(_differs(base, other, target) for target in free):
-            out.append(f"{name}: {own:.4g}, truly {numbers[name]:.4g}")
+    """What the truth changes and no free parameter can follow."""
+    followed, nominal = changing(machine, numbers, free), machine.nominal()
+    out = [f"{n}: {nominal[n]:.4g}, truly {x:.4g}" for n, x in numbers.items() if n not in followed]
     if machine.delay and not any(target.endswith(".delay") for target in free):
         out.append(f"delay: 0, truly {machine.delay:g}")
     return out
@@ -454,8 +467,7 @@ def _differs(base: mujoco.MjModel, other: mujoco.MjModel, target: str) -> bool:
 
 def one_machine(name: str, seed: int) -> dict[str, Any]:
     """What a user would do who edits nothing, and where the truth lies."""
-    machine = MACHINES[name]
-    folder, numbers = prepared(name, seed)
+    machine, folder = MACHINES[name], prepared(name, seed)
     row: dict[str, Any] = {"machine": name, "seed": seed}
     row["command"] = f"python examples/studies/init_then_calibrate.py --machines {name} --seed {seed}"
     row["init"] = command(folder, "init", "model.xml", *[f"{log}.{machine.suffix}" for log in LOGS], "--yes")
@@ -467,13 +479,21 @@ def one_machine(name: str, seed: int) -> dict[str, Any]:
     row["calibrate"] = command(folder, "calibrate", "calibrate.toml", "--out", "out")
     if not (folder / "out" / "result.json").is_file():
         return {**row, "failed": (folder / "calibrate.txt").read_text()[-600:]}
+    return row | judged(name, seed, row)
+
+
+def judged(name: str, seed: int, row: Mapping[str, Any]) -> dict[str, Any]:
+    """What a calibration found, against the truth."""
+    machine, folder = MACHINES[name], FOLDERS / f"{name}-{seed}"
+    numbers = machine.true_numbers(generator(name, seed))
+    written = tomllib.loads((folder / "calibrate.toml").read_text())
     result = json.loads((folder / "out" / "result.json").read_text())
     true = machine.compiled(numbers)
     free = free_parameters(folder, machine, true)
     left = find_equivalent(folder, machine, numbers, free)
     codes = [f["code"] for f in result["findings"] if f["severity"] == "blocking"]
     errors = [{k: s[k] for k in ("channel", "unit", "rmse", "rmse_default")} for s in result["holdout"]]
-    return row | {
+    return {
         "converged": result["checked"] and row["calibrate"]["code"] in (0, 3) and not {*codes} & {*NOT_CONVERGED},
         "blocking": codes,
         "foretold": next(iter(re.findall(r"\(about [^)]*\)", (folder / "init.txt").read_text())), ""),
@@ -820,7 +840,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--machines", nargs="*", default=list(MACHINES), choices=list(MACHINES))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--judge", action="store_true")
     given = parser.parse_args()
+    if given.judge:
+        again = [row if "failed" in row else row | judged(row["machine"], row["seed"], row) for row in fits(KEPT)]
+        write_text(KEPT, "".join(json.dumps(row) + "\n" for row in again))
+        given.machines = []
     for name in given.machines:
         ensure(KEPT, {"machine": name, "seed": given.seed}, partial(one_machine, name, given.seed))
     rows = sorted(fits(KEPT), key=lambda row: (row["seed"], list(MACHINES).index(row["machine"])))
