@@ -13,7 +13,7 @@ Both run as commands, with their time taken. What is compared:
 
 Parameters that stay fixed may change what the others have to be: the damping of a joint is a part of its servo's
 velocity gain, forces that no log knows are relative to the masses. ``equivalent`` holds the values with which a model
-of the machine accelerates as the machine does, within 5 % (RMS), though such dampings are nominal, and what the file
+of the machine accelerates (and pushes, where forces are logged) as it does, within 5 % (RMS), though such dampings are nominal, and what the file
 of `sipe init` leaves out for it "shows as" others or is what forces are relative to. Where there are no such values,
 it is the truth, but for the error of such a damping in the velocity gain.
 
@@ -351,7 +351,7 @@ def free_parameters(folder: Path, machine: Machine, true: mujoco.MjModel) -> lis
 
 
 def find_equivalent(folder: Path, machine: Machine, numbers: Mapping[str, float], free: Sequence[Free]) -> float:
-    """Set what is equivalent to the truth; the share of the accelerations that is left then.
+    """Set what is equivalent; the share of accelerations and measured forces that is left then.
 
     Gauss-Newton steps on the accelerations at samples of the first log, from the truth, of least length.
     """
@@ -364,7 +364,8 @@ def find_equivalent(folder: Path, machine: Machine, numbers: Mapping[str, float]
     for one in free:
         one.equivalent = None if one.truth is None else sum(one.truth) / 2 + _damping_beside(one, free, base, true)
     samples = np.load(folder / "samples.npz")
-    wanted = accelerations(true, samples)
+    forces = '.force"' in text  # that are measured
+    wanted = motions(true, samples, forces)
     usual = np.sqrt(np.mean(wanted**2, axis=0)) + 1e-9
     truth = np.array([one.equivalent for one in moving], float)
     sizes = np.array(
@@ -373,7 +374,7 @@ def find_equivalent(folder: Path, machine: Machine, numbers: Mapping[str, float]
 
     def missed(values: FloatArray) -> FloatArray:
         model = written_into(base, moving, values)
-        return np.asarray(((accelerations(model, samples) - wanted) / usual).ravel())
+        return np.asarray(((motions(model, samples, forces) - wanted) / usual).ravel())
 
     now = truth.copy()
     for _ in range(_STEPS):
@@ -405,14 +406,14 @@ def written_into(base: mujoco.MjModel, free: Sequence[Free], values: FloatArray)
     return model
 
 
-def accelerations(model: mujoco.MjModel, samples: Mapping[str, FloatArray]) -> FloatArray:
-    """Accelerations (n, nv) at positions, velocities, activations and commands."""
+def motions(model: mujoco.MjModel, samples: Mapping[str, FloatArray], forces: bool) -> FloatArray:
+    """Accelerations (n, nv) at positions, velocities, activations and commands, and forces of actuators (n, nu)."""
     data, out = mujoco.MjData(model), []
     for qpos, qvel, act, ctrl in zip(*(samples[k] for k in ("qpos", "qvel", "act", "ctrl")), strict=True):
         data.qpos[:], data.qvel[:], data.act[:], data.ctrl[:] = qpos, qvel, act, ctrl
         data.qacc_warmstart[:] = 0
         mujoco.mj_forward(model, data)
-        out.append(data.qacc.copy())
+        out.append(np.append(data.qacc, data.actuator_force if forces else []))
     return np.array(out)
 
 
@@ -499,7 +500,7 @@ def judged(name: str, seed: int, row: Mapping[str, Any]) -> dict[str, Any]:
         "foretold": next(iter(re.findall(r"\(about [^)]*\)", (folder / "init.txt").read_text())), ""),
         "holdout": _rounded(errors),
         "ratio": _rounded(float(np.exp(np.mean([np.log(e["rmse"] / e["rmse_default"]) for e in errors])))),
-        "left of the accelerations": _rounded(left),
+        "left of the motion": _rounded(left),
         "parameters": intervals(free, result),
         "fixed": fixed(machine, numbers, [target for one in free for target in one.targets]),
         "likelihood": written.get("likelihood", "segments"),
