@@ -13,7 +13,8 @@ Both run as commands, with their time taken. What is compared:
 
 Parameters that stay fixed may change what the others have to be: the damping of a joint is a part of its servo's
 velocity gain, forces that no log knows are relative to the masses. ``equivalent`` holds the values with which a model
-of the machine accelerates (and pushes, where forces are logged) as it does, within 5 % (RMS), though such dampings are nominal, and what the file
+of the machine accelerates, and pushes where forces are logged, as the machine does within 5 % (RMS), though such
+dampings are nominal, and what the file
 of `sipe init` leaves out for it "shows as" others or is what forces are relative to. Where there are no such values,
 it is the truth, but for the error of such a damping in the velocity gain.
 
