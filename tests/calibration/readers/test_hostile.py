@@ -23,7 +23,12 @@ from tests.calibration.readers.files import OTHERS
 from tests.problems.log_files import WRITERS, Table, Written, configured, lerobot_folder, matlab_7_3_file
 from tests.problems.log_tables import load, regular
 
-ALL: dict[str, Callable[[Path, Table], Written]] = {**WRITERS, **OTHERS, "MATLAB 7.3": matlab_7_3_file}
+ALL: dict[str, Callable[[Path, Table], Written]] = {
+    **WRITERS,
+    **OTHERS,
+    "MATLAB 7.3": matlab_7_3_file,
+    "LeRobot 3": lambda folder, table: lerobot_folder(folder, table, "v3.0"),
+}
 CASES = 40  # of each format; a longer run has more
 
 
