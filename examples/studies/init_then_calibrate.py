@@ -384,7 +384,8 @@ def find_equivalent(folder: Path, machine: Machine, numbers: Mapping[str, float]
         now = now - sizes * (np.linalg.pinv(slopes, rcond=1e-4) @ here)
     left = float(np.sqrt(np.mean(missed(now) ** 2)))
     for one, value in zip(moving, now, strict=True):
-        one.equivalent = float(value) if left < _EXACT else one.equivalent
+        least = 0.0 if one.truth and one.truth[0] >= 0 else -np.inf
+        one.equivalent = max(float(value), least) if left < _EXACT else one.equivalent
     return left
 
 
