@@ -18,7 +18,6 @@ from scipy.ndimage import gaussian_filter1d
 from sipe_bayes.calibration.init.cases import Source, case_of, loaded
 from sipe_bayes.calibration.init.draft import Draft, Reading
 from sipe_bayes.calibration.init.matching import Match
-from sipe_bayes.calibration.init.regression import turning_of
 from sipe_bayes.calibration.machine import Machine
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.smoothing import filled
@@ -51,8 +50,6 @@ def with_forces(
         return draft, notes
     regression = case_of(draft, model, machine, sources, folder).regression
     motion = regression.given_motion
-    accelerations = motion.states[:, model.nq + model.nv : model.nq + 2 * model.nv]
-    resisting = np.stack([motion.speed, turning_of(motion.speed), accelerations], axis=-1)
     place = sum(len(m.channels) for m in draft.config(folder).measurements)
     whole = loaded(replace(draft, measurements=(*draft.measurements, *first)), sources, folder)
     parts = zip(whole, regression.logs, regression.widths, regression.rows, strict=True)
@@ -62,7 +59,7 @@ def with_forces(
     readings = []
     for reading, values in zip(first, measured.T, strict=True):
         dof = int(model.joint(_find_joint(reading)).dofadr[0])
-        force = _add_resistance(motion.asked[:, dof], resisting[:, dof], values)
+        force = _add_resistance(motion.asked[:, dof], motion.resisting[:, :, dof].T, values)
         both_ways = min(np.mean(force > 0), np.mean(force < 0)) > _BOTH_WAYS
         if (both_ways or sizes) and not (values < 0).any():
             notes.append(f"{reading.match.column!r} is not used: it never changes its sign")

@@ -127,7 +127,10 @@ def candidates(
     flown = {_thrust_at(model, a) for a, _ in driven} & {*bodies}
     carrying = bases(model) - flown if driven and not attached else ()  # what is attached would stand for their inertia
     gains = [(a, p) for a, r in driven for p in propose_kinds(model, f"actuator:{a.name}", _classes(model, a, r))]
-    fed_back = {a.joint for a, gain in gains if gain.targets[-1].endswith((".kv", ".bias_velocity"))}
+    # a gain of the velocity alone does as damping does; that of a speed servo is its set-point's, too
+    fed_back = {
+        a.joint for a, gain in gains if len(gain.targets) == 1 and gain.targets[0].endswith((".kv", ".bias_velocity"))
+    }
     rotors = {actuator.joint for actuator in machine.actuators}
     of_joints = _of_tendons(model, [a for a, _ in driven], sizes) if joints else []
     for joint in (*(j for j in joints if not j.base), *passive):

@@ -88,6 +88,12 @@ class Motion:
         """The velocities (R, V) that damping acts on."""
         return self.states[:, -self.asked.shape[1] :]
 
+    @property
+    def resisting(self) -> FloatArray:
+        """What viscous friction, dry friction and rotors are multiples of, (3, R, V): speeds, signs, accelerations."""
+        count = self.asked.shape[1]
+        return np.stack([self.speed, turning_of(self.speed), self.states[:, -2 * count : -count]])
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -99,6 +105,7 @@ class Outcome:
         errors: (A,) standard errors of these.
         damping: (V,) force per velocity.
         friction: (V,) level of dry friction.
+        rotor: (V,) inertia beyond the model's, of rotors and gears.
         delay: samples, between those that were tried.
         behind: (D,) of each delay that was tried, by how much more is left than at the best: sum of logarithms.
         unexplained: the sum of the logarithms of what is left: the smaller the better.
@@ -113,6 +120,7 @@ class Outcome:
     errors: FloatArray
     damping: FloatArray
     friction: FloatArray
+    rotor: FloatArray
     delay: float
     behind: FloatArray
     unexplained: float
@@ -208,7 +216,7 @@ class Regression:
         if not len(dofs):
             none, gains = np.ones(self.known.shape), np.zeros(len(self.actuators))
             rest = 0.0, np.zeros(len(self.delays)), 0.0, 0.0, np.zeros_like(motion.asked), size
-            return Outcome(none, gains, gains + np.inf, 0 * none, 0 * none, *rest)
+            return Outcome(none, gains, gains + np.inf, 0 * none, 0 * none, 0 * none, *rest)
         costs, last = np.full(len(self.delays), np.inf), len(self.delays) - 1
         left = list(range(0, last + 1, 1 if every else 3))
         while left:  # down to the best of its neighbours
@@ -242,16 +250,16 @@ class Regression:
         and of where that rests. Gains of forces may have any sign, friction none but its own.
         """
         count, n, actuators = len(motion.asked), len(dofs), len(self.actuators)
-        speed, given = motion.speed[:, dofs], motion.given[delay][:, dofs]
-        usual = np.sqrt((speed**2).mean(0)) + 1e-12
-        parts = [-speed / usual, -turning_of(speed), np.ones((count, n))]
+        resisting, given = motion.resisting[:, :, dofs], motion.given[delay][:, dofs]
+        usual = np.sqrt((resisting**2).mean(1, keepdims=True)) + 1e-12
+        parts = [*(-resisting / usual), np.ones((count, n))]
         held = (motion.asked - motion.inertial)[:, dofs]
         rest = 0.1 * np.sqrt((held**2).mean(0)) / size  # what a zero that is a little off changes
         kinds = self.simulator.model.actuator_dyntype[self.actuators] == int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
         rest[given[..., kinds].any(axis=(0, 2))] = np.inf  # where integrators begin
         loose = np.array([drive not in SERVOS for drive in self.drives], bool) & ~self.one_way
-        low = [np.where(loose, -np.inf, 0.0), np.zeros(2 * n), -rest - 1e-9]
-        high = [np.full(actuators + 2 * n, np.inf), rest + 1e-9]
+        low = [np.where(loose, -np.inf, 0.0), np.zeros(3 * n), -rest - 1e-9]
+        high = [np.full(actuators + 3 * n, np.inf), rest + 1e-9]
         if self.springs:
             places = _places(self.plain)[dofs]
             own = motion.states[:, places] - motion.states[:, places].mean(0)
@@ -275,18 +283,18 @@ class Regression:
         found = scipy.optimize.lsq_linear(triangle.T, rotated, (low * scale, high * scale), method="bvls").x / scale
         left = (wanted - design @ found).reshape(count, n)
         miss = np.clip(np.sqrt((left**2).sum(0) / motion.free.sum()), BEST, None)
-        whole, (damping, friction) = np.ones(self.known.shape), np.zeros((2, *self.known.shape))
+        whole, resistance = np.ones(self.known.shape), np.zeros((3, *self.known.shape))
         whole[dofs], shares = miss, np.zeros_like(motion.asked)
-        usual = np.sqrt((motion.speed[:, dofs] ** 2).mean(0)) + 1e-12
-        damping[dofs] = found[actuators : actuators + n] * size / usual
-        friction[dofs] = found[actuators + n : actuators + 2 * n] * size
+        usual = np.sqrt((motion.resisting[:, :, dofs] ** 2).mean(1)) + 1e-12
+        resistance[:, dofs] = found[actuators : actuators + 3 * n].reshape(3, n) * size / usual
         shares[:, dofs], gains, errors = left, found[:actuators], np.zeros(actuators)
         if told:
             weighted = (columns / miss[:, None]).reshape(count * n, -1) / scale
             spread = np.linalg.inv(weighted.T @ weighted + 1e-10 * np.eye(len(scale)))
             errors = np.sqrt(np.diag(spread)[:actuators] * count / self._independent(left)) / scale[:actuators]
         both = float(np.log(np.minimum(miss, WORST)).sum()), self._far_off(gains)
-        return Outcome(whole, gains, errors, damping, friction, 0.0, np.zeros(0), *both, shares, sizes)
+        damping, friction, rotor = resistance
+        return Outcome(whole, gains, errors, damping, friction, rotor, 0.0, np.zeros(0), *both, shares, sizes)
 
     def independent(self, outcome: Outcome) -> float:
         """How many independent numbers of each degree of freedom the rows hold, by the correlation of what is left."""

@@ -106,10 +106,16 @@ def sizes_of(model: mujoco.MjModel, machine: Machine, regression: Regression, ou
     states = np.concatenate([np.zeros((len(motion.states), 1)), motion.states[:, : model.nq + model.nv]], axis=1)
     plain = Sizes.of(model, machine, states, None)
     forces = np.abs(motion.asked) + outcome.damping * np.abs(motion.speed) + outcome.friction
-    force = np.maximum(np.quantile(forces, 0.9, axis=0), 1e-9)
+    driven, faster = motion.given[0].sum(axis=-1), motion.resisting[2]
+    force, driven, faster = (np.quantile(np.abs(values), 0.9, axis=0) for values in (forces, driven, faster))
+    force, rotor = (
+        np.maximum(np.maximum(force, driven), 1e-9),
+        driven / np.maximum(faster, 1e-9),
+    )  # what drives can move
     at = {joint.name: int(model.joint(joint.name).dofadr[0]) for joint in machine.joints}
     known = {name: float(force[dof]) for name, dof in at.items() if regression.known[dof]}
-    return replace(plain, force=plain.force | known)
+    moved = {name: max(plain.inertia[name], float(rotor[at[name]])) for name in known}
+    return replace(plain, force=plain.force | known, inertia=plain.inertia | moved)
 
 
 def inform_bounds(
@@ -117,6 +123,8 @@ def inform_bounds(
 ) -> tuple[list[Proposal], dict[str, float]]:
     """The proposals with bounds that hold what the regression says, and these values, SI, by name."""
     values, out = dict[str, float](), []
+    rotor = outcome.rotor + model.dof_armature
+    resistance = {"damping": outcome.damping, "frictionloss": outcome.friction, "armature": rotor}
     actuators = [model.actuator(index).name for index in regression.actuators]
     for one in proposals:
         owner, _, field = one.targets[0].rpartition(".")
@@ -127,10 +135,10 @@ def inform_bounds(
                 gain, own = (1 / gain if field == "resistance" else gain), bind(model, one.targets[0]).value
                 values[one.name] = gain * own
                 one = _around(one, gain, own)
-        elif kind == "joint" and field in ("damping", "frictionloss") and not one.relative:
+        elif kind == "joint" and field in resistance and not one.relative:
             dof = int(model.joint(name).dofadr[0])
             if regression.known[dof]:
-                value = float((outcome.damping if field == "damping" else outcome.friction)[dof])
+                value = float(resistance[field][dof])
                 values[one.name] = value  # what the model lacks is in it, too
                 one = replace(one, high=max(one.high, rounded_up(4 * value) if value else 0.0))
         out.append(one)

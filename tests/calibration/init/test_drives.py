@@ -85,3 +85,10 @@ def test_the_gain_of_a_tendon_is_asked_for_unless_its_command_is_a_force(
     assert [reading.unit for reading in draft.commands] == [units[column]]
     assert ("fan_gain" in {unknown.name for unknown in draft.free}) == (column == "u")
     assert any("all forces are relative to" in doubt for doubt in draft.open_doubts) == (column == "u")
+
+
+def test_the_damping_beside_a_velocity_servo_is_free(tmp_path: Path) -> None:
+    """Its gain is that of the set-point too: fixed at the model's, the damping would be what forces are relative to."""
+    model = PENDULUM.replace('<motor name="fan" joint="hinge"', '<velocity name="fan" joint="hinge" kv=".4"')
+    draft = driven(tmp_path, model, "", 1.0, "hinge_cmd_vel")
+    assert {"fan_kv", "hinge_damping"} <= {unknown.name for unknown in draft.free}

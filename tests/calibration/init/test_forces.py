@@ -63,7 +63,18 @@ def test_efforts_that_move_rotors_and_overcome_friction_that_the_model_lacks_are
     print([(r.unit, r.notes, r.doubts) for r in forces])
     assert all(r.unit == "N m" and not r.doubts for r in forces)
     assert all("explains 9" in note or "explains 100" in note for r in forces for note in r.notes)
-    assert {"upper_mass", "lower_mass"} <= {unknown.name for unknown in draft.proposed}
+    assert {"upper_mass", "lower_mass"} <= {unknown.name for unknown in draft.free}
+
+
+def test_rotors_that_the_model_lacks_are_free_and_no_delay(tmp_path: Path) -> None:
+    """Of ten times the inertia of the lower link, with friction that goes with such gears."""
+    draft = proposed(tmp_path, {"shoulder": 1.0, "elbow": 1.0}, "current_{}_A", rotor=0.05)
+    free = {unknown.name: (unknown.low, unknown.high) for unknown in draft.free}
+    print(draft.delay, free)
+    assert draft.delay < 0.5
+    for joint in ("shoulder", "elbow"):
+        assert free[f"{joint}_armature"][1] > 0.05
+        assert free[f"{joint}_frictionloss"][1] > 0.2
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ def outcome(*behind: float) -> Outcome:
     """Of delays that leave so much more than the best: logarithms."""
     none, costs = np.zeros(1), np.array(behind)
     delay = float(np.argmin(costs))
-    return Outcome(none, none, none, none, none, delay, costs - costs.min(), 0.0, 0.0, np.zeros((1, 1)), none)
+    return Outcome(none, none, none, none, none, none, delay, costs - costs.min(), 0.0, 0.0, np.zeros((1, 1)), none)
 
 
 @pytest.mark.parametrize(("behind", "asked"), [([0.34, 0.1, 0.0, 0.18], True), ([0.4, 0.04, 0.02, 0.0], False)])
