@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from sipe_bayes.inference.recorded import Progress
 
 _WIDTH = 58  # of what a structure has
+TIME_LIMIT = 240.0  # s; with the report five minutes
 _TRIED, _ERRORS, _VALUES = 5, 2, 3  # lines of each kind that are printed: twenty in all
 _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 
@@ -41,8 +42,8 @@ def discover(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
     threads: Annotated[int | None, typer.Option(help="Native threads; default all cores.")] = None,
     time_limit: Annotated[
-        float | None, typer.Option(help="Seconds, after which the search ends with what it has.")
-    ] = None,
+        float, typer.Option(help="Seconds, after which the search ends with what it has; the same command goes on.")
+    ] = TIME_LIMIT,
 ) -> None:
     """Physics that the model lacks: proposed, fitted, and compared by what it predicts of pieces that were held out."""
     from sipe_bayes.calibration.discover import run_discovery

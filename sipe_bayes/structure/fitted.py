@@ -136,7 +136,7 @@ class Fitting:
             initial: (N + P,), where the search begins; default as ``laplace`` does.
             budget: rollouts at most.
             progress: called along the way.
-            begin: the structure whose initial states the search begins with; default the measured ones.
+            begin: the structure whose initial states the search begins with, if it has as many.
             part: a structure with some of these extensions; none by default.
 
         Raises:
@@ -145,22 +145,28 @@ class Fitting:
         simulator = self.simulator(placed)
         prior = self.prior_of(simulator)
         windows = self.windows(simulator)
-        left = max(budget - self._scoring(windows), 1)
-        begins = [(initial, None if begin is None else self._starts_of(begin, simulator, placed))]
+        # what an extension's own states are nobody knows: then the search begins as one without an estimate does
+        known = begin is not None and begin.starts.shape[-1] == windows.num_start
+        begins: list[tuple[FloatArray | None, FloatArray | None]] = [
+            (initial, begin.starts if known and begin else None)
+        ]
         begins += [] if part is None else [self._part_optimum(placed, simulator, part)]
         rollouts, found = 0, list[tuple[Scores, FitResult]]()
-        for number, at in enumerate(begins):
-            laplace = self._laplace(simulator, prior, at, left - rollouts, progress)
+        for at in begins:
+            left = budget - rollouts - windows.rollouts - self._scoring(windows)
+            if found and left < rollouts:
+                break
+            laplace = self._laplace(simulator, prior, at, max(left, 1), progress)
             try:
                 laplace.fit(self.trajectories)
                 assert laplace.result is not None
                 found.append((self._scores(windows, laplace.result, prior), laplace.result))
             except (BudgetTooSmall, ValueError):  # LinAlgError is one; what was found stands
-                if not found and (number + 1 == len(begins) or left <= rollouts + laplace.rollouts):
+                if not found and (at is begins[-1] or left <= laplace.rollouts):
                     raise
             rollouts += laplace.rollouts
             ahead = part is None or (found and found[-1][0].evidence >= part.evidence - _UNNEEDED)
-            if ahead or (found and (left < 2 * rollouts or time.monotonic() > self.ends)):
+            if ahead or (found and time.monotonic() > self.ends):
                 break
         (evidence, pieces), best = max(found, key=lambda one: (one[1].finding is None, one[0].evidence))
         assert best.starts is not None
@@ -200,7 +206,7 @@ class Fitting:
 
     def _part_optimum(
         self, placed: Sequence[Placed], simulator: Simulator, part: FittedStructure
-    ) -> tuple[FloatArray, FloatArray | None]:
+    ) -> tuple[FloatArray, FloatArray]:
         """Theta (N + P,) and starts (W, D) of a structure where a part of it ended: further extensions do nothing."""
         by_label = {one.label: one for one in placed}
         extensions = [by_label[label] for label in part.labels]
@@ -209,16 +215,8 @@ class Fitting:
         for one in extensions:
             theta[one.label] = part.theta[first : first + len(one.parameters)]
             first += len(one.parameters)
-        starts = self._starts_of(part, simulator, placed)
+        starts = mapped_starts(self.simulator(extensions).model, simulator.model, part.starts)
         return np.concatenate([theta[""], *(theta.get(one.label, one.plain) for one in placed)]), starts
-
-    def _starts_of(self, one: FittedStructure, simulator: Simulator, placed: Sequence[Placed]) -> FloatArray | None:
-        """Starts (W, D) where a structure ended, as those of another one; None of one with states that this lacks."""
-        by_label = {other.label: other for other in placed}
-        if not set(one.labels) <= set(by_label):
-            same = one.starts.shape[-1] == self.windows(simulator).num_start
-            return one.starts if same else None
-        return mapped_starts(self.simulator([by_label[x] for x in one.labels]).model, simulator.model, one.starts)
 
     def _laplace(
         self,

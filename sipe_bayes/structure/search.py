@@ -124,14 +124,23 @@ class StructureSearch:
         """
         key, own = (one.labels, one.theta.tobytes()), self.structure(one.labels)
         if key not in self._linear:
-            simulator = self.fitting.simulator(own)
-            windows = self.fitting.windows(simulator) if windows is None else windows
+            simulator, lin = self.fitting.simulator(own), None
+            whole = windows = self.fitting.windows(simulator) if windows is None else windows
+            if any(p.extension.slow for p in own):  # its residuals, beside what columns do without it
+                (residual,), _ = windows.residuals(one.theta[None], one.starts[None])
+                quick = self.fitting.windows(self.fitting.simulator([p for p in own if not p.extension.slow]))
+                quick.rollouts, quick.budget, quick.deadline = windows.rollouts, windows.budget, windows.deadline
+                lin = replace(quick.linearise(one.theta, one.starts), residual=residual)
+                windows = quick
             taken = {*one.labels, *(t for p in own for q in p.parameters for t in q.targets)}
             every = self._placed.values()
             rest = [p for p in every if not taken & {p.label, *(t for q in p.parameters for t in q.targets)}]
             prior = QuadraticPrior.of(self.fitting.prior_of(simulator))
             at = one.theta, one.noise, one.starts, prior
-            self._linear[key] = AugmentedModel(windows, *at, tell=tell, placed=rest)
+            try:
+                self._linear[key] = AugmentedModel(windows, *at, lin, tell=tell, placed=rest)
+            finally:
+                whole.rollouts = windows.rollouts
         return self._linear[key]
 
     @property
@@ -210,7 +219,12 @@ class StructureSearch:
         best = ranked[0][0] if ranked else 0.0
         most = 2 * options.width if state.beam == ((),) else options.width
         close = [(gain, grown) for gain, grown in ranked[options.width : most] if gain >= best / 4]
-        return tuple(grown for _, grown in ranked[: options.width] + close)
+        chosen = [grown for _, grown in ranked[: options.width] + close]
+        return tuple(sorted(chosen, key=self._is_slow))  # more is known where the time ends within a round
+
+    def _is_slow(self, labels: Sequence[str]) -> bool:
+        """Whether a structure is simulated in shorter steps."""
+        return any(one.extension.slow for one in self.structure(labels))
 
     def _ranked(self, state: DiscoverState, here: FittedStructure) -> DiscoverState:
         """The state with predicted gains beside a structure, best first; cut where the budget ends."""

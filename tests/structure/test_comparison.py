@@ -106,10 +106,10 @@ def search_of(*fitted: FittedStructure) -> tuple[StructureSearch, list[FittedStr
         ends=np.inf, trajectories=[0], holdout=None, corrected=lambda columns: fitting, simulator=lambda pieces: None
     )
     search, asked = StructureSearch(fitting, ()), list[FittedStructure]()
-    named = SimpleNamespace(extension=SimpleNamespace(native=True), parameters=(None,))
+    named = SimpleNamespace(extension=SimpleNamespace(native=True, slow=False), parameters=(None,))
     search._placed = dict.fromkeys("abcd", named)  # type: ignore[arg-type]
 
-    def fit(state: DiscoverState, labels: tuple[str, ...], initial: np.ndarray) -> DiscoverState:
+    def fit(state: DiscoverState, labels: tuple[str, ...], initial: np.ndarray, begin: object) -> DiscoverState:
         assert initial.tolist() == [0.5, *(ord(x) / 1000 for x in labels)]
         one = next(x for x in fitted if set(x.labels) == set(labels))
         asked.append(one)
@@ -168,7 +168,7 @@ def test_a_fit_that_was_cut_short_below_its_own_part_says_nothing(evidence: floa
     search = StructureSearch(fitting, (), budget=10_000)
     begun = DiscoverState(Phase.FIT, (structure(""), structure("a", evidence=100.0)))
     with mock.patch.object(search, "structure", return_value=[]):
-        after = search._fitted(begun, ("a", "b"), np.zeros(3))
+        after = search._fitted(begun, ("a", "b"), np.zeros(3), None)
     assert (after.of("ab") is one) is kept
     assert (after.failed == (("a", "b"),)) is not kept
     assert after.is_tried("ba")

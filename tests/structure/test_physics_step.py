@@ -141,9 +141,9 @@ def test_a_machine_without_steps_is_told_from_one_with_the_models(step: float, s
     """False alarms at 1 %, and the seed is fixed."""
     logs, drawn, values = fitted(step, 3)
     seen = misfit(find_discrepancy(logs), drawn.stddev.numpy())
-    print(seen.text)
+    print(seen.finding.text)
     assert seen.alarm == shows
-    assert ("physics step" in seen.text) == shows
+    assert ("physics step" in seen.finding.text) == shows
     for tolerances in (EXACT, ALLOWED):
         low, high = find_discrepancy(logs, tolerances).draw(drawn, 0).quantile([0.05, 0.95]).numpy()
         print(low, values, high, drawn.quantile([0.05, 0.95]).numpy())

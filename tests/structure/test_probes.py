@@ -59,7 +59,7 @@ def test_what_is_missing_beside_a_delay_is_named_and_the_delay_held(cause: str) 
         own.value(lacking.draw(posterior, 0).quantile([0.05, 0.95]).numpy()[:, 2]),
         posterior.quantile([0.05]).numpy(),
     )
-    print(seen.text, lacking.causes, delay, own.value(plain[0, 2]))
+    print(seen.finding.text, lacking.causes, delay, own.value(plain[0, 2]))
     assert seen.alarm
     assert cause in (*seen.cause.split(" or "), *lacking.causes)
     assert own.value(plain[0, 2]) > values[0] + 0.01

@@ -39,7 +39,7 @@ class _Numerics(Extension):
 class PhysicsStep(_Numerics):
     """Shorter physics steps."""
 
-    name = "physics_step"
+    name, slow = "physics_step", True
     shorter = 8
     reference = "L. F. Richardson 1911"
 
