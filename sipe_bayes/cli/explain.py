@@ -55,7 +55,8 @@ def _entries(name: str) -> list[_Entry]:
 
     if not is_folder(name):
         return [_alone(_named(name))]
-    entries = _of_run(Path(name) / "result.json")
+    records = [Path(name) / file for file in ("result.json", "structures.json")]
+    entries = _of_run(next((record for record in records if record.exists()), records[0]))
     if not entries:
         print(f"{name}: nothing was noticed")
     return entries
@@ -81,7 +82,7 @@ def _of_run(record: Path) -> list[_Entry]:
     from sipe_bayes.core.finding_texts import Severity
     from sipe_bayes.core.findings import rank
 
-    what, remedy = "the result of a calibration", "give the folder of sipe calibrate"
+    what, remedy = "the result of a run", "give the folder of sipe calibrate or sipe discover"
     plain = read_json(record, what, remedy)
     entries: dict[Code, _Entry] = {}
     with reading(record, what, remedy):

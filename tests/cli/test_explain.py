@@ -13,14 +13,15 @@ from sipe_bayes.core.finding_advice import ADVICE
 from sipe_bayes.core.findings import Code, finding
 
 
-def test_what_a_run_found(tmp_path: Path) -> None:
+@pytest.mark.parametrize("record", ["result.json", "structures.json"])  # of a calibration, and of a search
+def test_what_a_run_found(record: str, tmp_path: Path) -> None:
     """With the run's own numbers, the worst first, each code once."""
     found = [
         finding(Code.MISFIT_NOT_ASKED),
         finding(Code.NOISE_EXCEEDS_SCATTER, channel="q", ratio=12.34),
         finding(Code.NOISE_EXCEEDS_SCATTER, channel="q", ratio=5.0),
     ]
-    (tmp_path / "result.json").write_text(json.dumps({"findings": [one.to_dict() for one in found]}))
+    (tmp_path / record).write_text(json.dumps({"findings": [one.to_dict() for one in found]}))
     lines = CliRunner().invoke(app, ["explain", str(tmp_path)]).output.splitlines()
     assert lines[0] == "noise_exceeds_scatter (blocking, 2 times, of which the first)"
     assert "12.3 times" in lines[1]
