@@ -58,7 +58,7 @@ class Extension(ABC):
     nearest: str = ""  # the element of MJCF that comes nearest, where it has none of its own
     by_name: bool = False  # tried only where it is named
     fixed: bool = False  # nothing about it is unknown: it has no parameters
-    slow: bool = False  # a simulation takes several times as long; what parameters do is about the same without it
+    slow: int = 1  # how many times as long a simulation takes; if longer, what parameters do is about the same without
 
     @abstractmethod
     def sentence(self, site: str) -> str:

@@ -67,6 +67,7 @@ class StructureSearch:
         self.options, self.budget, self.progress = options or DiscoverOptions(), budget, progress
         self._rollouts, self._fit_rollouts, self._doing = 0, 0, ""  # before the present fit, of it, and what it is for
         self.ended = "budget"  # what ends a search that is cut short: that, "time", or "interrupted"
+        self._longest = 0.0  # seconds of a fit of a structure that is not slow
         self._machine: Machine | None = None
         self._placed: dict[str, Placed] = {}
         self._linear: dict[tuple[tuple[str, ...], bytes], AugmentedModel] = {}  # by labels and optimum
@@ -79,9 +80,9 @@ class StructureSearch:
         self._rollouts, self._fit_rollouts = state.rollouts, 0
         self._doing = state.describe(len(self._placed))
         self._tell("")
-        over = state.rollouts >= self.budget or self.is_late
-        if state.phase is not Phase.PLAIN and state.fitted and over:
-            self.ended = "time" if self.is_late else self.ended
+        late = self.is_late or self._ends_late(state)
+        if state.phase is not Phase.PLAIN and state.fitted and (late or state.rollouts >= self.budget):
+            self.ended = "time" if late else self.ended
             return replace(state, phase=Phase.DONE, cut=state.cut if state.done else state.phase)
         state = {
             Phase.PLAIN: self._plain,
@@ -99,6 +100,12 @@ class StructureSearch:
     def is_late(self) -> bool:
         """Whether the time limit has passed."""
         return time.monotonic() > self.fitting.ends
+
+    def _ends_late(self, state: DiscoverState) -> bool:
+        """Whether the next fit would end after the time limit, if it takes as long as the longest one until now."""
+        if state.phase is not Phase.FIT:
+            return False
+        return time.monotonic() + self._longest * self._slowness(state.queue[0]) > self.fitting.ends
 
     def _tell(self, what: str, rollouts: int = 0, _: int = 0) -> None:
         """How far the present step is, after some rollouts of a fit of its own; fewer are those of its next fit."""
@@ -126,9 +133,9 @@ class StructureSearch:
         if key not in self._linear:
             simulator, lin = self.fitting.simulator(own), None
             whole = windows = self.fitting.windows(simulator) if windows is None else windows
-            if any(p.extension.slow for p in own):  # its residuals, beside what columns do without it
+            if self._slowness(one.labels) > 1:  # its residuals, beside what columns do without it
                 (residual,), _ = windows.residuals(one.theta[None], one.starts[None])
-                quick = self.fitting.windows(self.fitting.simulator([p for p in own if not p.extension.slow]))
+                quick = self.fitting.windows(self.fitting.simulator([p for p in own if p.extension.slow == 1]))
                 quick.rollouts, quick.budget, quick.deadline = windows.rollouts, windows.budget, windows.deadline
                 lin = replace(quick.linearise(one.theta, one.starts), residual=residual)
                 windows = quick
@@ -220,11 +227,11 @@ class StructureSearch:
         most = 2 * options.width if state.beam == ((),) else options.width
         close = [(gain, grown) for gain, grown in ranked[options.width : most] if gain >= best / 4]
         chosen = [grown for _, grown in ranked[: options.width] + close]
-        return tuple(sorted(chosen, key=self._is_slow))  # more is known where the time ends within a round
+        return tuple(sorted(chosen, key=self._slowness))  # more is known where the time ends within a round
 
-    def _is_slow(self, labels: Sequence[str]) -> bool:
-        """Whether a structure is simulated in shorter steps."""
-        return any(one.extension.slow for one in self.structure(labels))
+    def _slowness(self, labels: Sequence[str]) -> int:
+        """How many times as long as another one's a simulation of a structure takes."""
+        return max((one.extension.slow for one in self.structure(labels)), default=1)
 
     def _ranked(self, state: DiscoverState, here: FittedStructure) -> DiscoverState:
         """The state with predicted gains beside a structure, best first; cut where the budget ends."""
@@ -310,7 +317,7 @@ class StructureSearch:
     def _fitted(
         self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray, begin: FittedStructure | None
     ) -> DiscoverState:
-        left, cut = max(self.budget - state.rollouts, 0), None
+        left, cut, began = max(self.budget - state.rollouts, 0), None, time.monotonic()
         self._rollouts, self._fit_rollouts = state.rollouts, 0
         parts = [other for other in state.fitted if set(other.labels) < set(labels)]
         part = max(parts, key=lambda other: other.evidence, default=None)
@@ -320,6 +327,7 @@ class StructureSearch:
             budget = max(min(most, left), 1)
             one = self.fitting.fit(self.structure(labels), initial, budget, self._tell, begin, part)
             cut = state.phase if self.is_late else cut
+            self._longest = max(self._longest, (time.monotonic() - began) / self._slowness(labels))
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
             spent = state.failed_rollouts + self._fit_rollouts
             cut = cut if isinstance(error, BudgetTooSmall) else None

@@ -106,7 +106,7 @@ def search_of(*fitted: FittedStructure) -> tuple[StructureSearch, list[FittedStr
         ends=np.inf, trajectories=[0], holdout=None, corrected=lambda columns: fitting, simulator=lambda pieces: None
     )
     search, asked = StructureSearch(fitting, ()), list[FittedStructure]()
-    named = SimpleNamespace(extension=SimpleNamespace(native=True, slow=False), parameters=(None,))
+    named = SimpleNamespace(extension=SimpleNamespace(native=True, slow=1), parameters=(None,))
     search._placed = dict.fromkeys("abcd", named)  # type: ignore[arg-type]
 
     def fit(state: DiscoverState, labels: tuple[str, ...], initial: np.ndarray, begin: object) -> DiscoverState:

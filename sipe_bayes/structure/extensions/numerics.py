@@ -39,8 +39,8 @@ class _Numerics(Extension):
 class PhysicsStep(_Numerics):
     """Shorter physics steps."""
 
-    name, slow = "physics_step", True
-    shorter = 8
+    name = "physics_step"
+    shorter = slow = 8
     reference = "L. F. Richardson 1911"
 
     def sentence(self, site: str) -> str:
