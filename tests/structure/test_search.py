@@ -36,7 +36,6 @@ def searched(*recorded: Trajectory, names: tuple[str, ...] = NAMES) -> Structure
 
 def test_a_right_model_is_left_as_it_is() -> None:
     structures = searched(log(pendulum(), [0.6, 0.08], 4))
-    print(structures.table())
     assert structures.best.labels == ()
     assert structures.weights.tolist() == [1.0] + [0.0] * (len(structures.fitted) - 1)
     assert structures.settled
@@ -105,7 +104,6 @@ def two_effects() -> Structures:
 
 def test_two_effects_are_found_one_after_the_other(two_effects: Structures) -> None:
     structures = two_effects
-    print(structures.table())
     assert set(structures.best.labels) == {"dry_friction:hinge", "quadratic_damping:hinge"}
     for label, truth in (("dry_friction:hinge", 0.15), ("quadratic_damping:hinge", 0.06)):
         (value,) = structures.posterior_of_piece(label).values(2000).mean(0)
@@ -193,7 +191,6 @@ def test_held_out_logs_speak_against_what_only_one_log_has(same: bool) -> None:
     )
     assert done == sorted(done)
     label = ("dry_friction:hinge",)
-    print(structures.table())
     assert structures.best.labels == (label if same else ())
     rubbing = structures.state.of(label)
     assert rubbing is not None
