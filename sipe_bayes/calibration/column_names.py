@@ -221,6 +221,8 @@ def _split_unit(plain: str, own: Collection[str]) -> tuple[str, list[str], list[
     for length, pieces in spelt * (spelt[0][0] > 1) + [(n, words[-n:]) for n in (3, 2, 1)]:  # rad_per_s, rad_s, rad
         if unit or len(words) <= length or ({*words[-length:]} <= {*own} and words.count(words[-1]) == 1):
             continue  # position_A1, unlike A1_current_A
+        if len(pieces) == len(pieces[0]) == 1 and re.search(rf"[^A-Za-z]{pieces[0]}\d+$", plain, re.IGNORECASE):
+            continue  # motor.m1
         if word := spell_unit(pieces):
             unit, words = word, words[:-length]
     return unit, words, numbers
