@@ -137,6 +137,7 @@ def calibrate(
     from sipe_bayes.calibration.discover import run_discovery
     from sipe_bayes.calibration.run import run
     from sipe_bayes.core.files import to_json
+    from sipe_bayes.core.telling import silent
     from sipe_bayes.report.verdicts import doubt
 
     with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json) as progress:
@@ -151,7 +152,11 @@ def calibrate(
         with exit_on_error("; the same command goes on"), ProgressBar(quiet=as_json, counted=False) as progress:
             paced = discover_commands.counted(progress)
             folder = Path(calibration.out) / "discover"
-            discovery = run_discovery(config, folder, seed, num_threads=threads, progress=paced)
+            limit = discover_commands.TIME_LIMIT
+            warn = silent if as_json else say_early
+            discovery = run_discovery(
+                config, folder, seed, num_threads=threads, progress=paced, time_limit=limit, warn=warn
+            )
     if as_json:
         print(to_json(calibration.to_dict() | ({} if discovery is None else {"discovery": discovery.to_dict()})))
     else:

@@ -101,6 +101,11 @@ class Fitting:
     ends: float = math.inf
     spans: bool = False
 
+    @property
+    def is_late(self) -> bool:
+        """Whether fits are to end with what they have."""
+        return time.monotonic() > self.ends
+
     def enough(self, placed: Sequence[Placed]) -> int:
         """Rollouts of as many steps of a fit as lead to its optimum."""
         windows = self.windows(self.simulator(placed))
@@ -162,11 +167,11 @@ class Fitting:
                 assert laplace.result is not None
                 found.append((self._scores(windows, laplace.result, prior), laplace.result))
             except (BudgetTooSmall, ValueError):  # LinAlgError is one; what was found stands
-                if not found and (at is begins[-1] or left <= laplace.rollouts):
+                if not found and (at is begins[-1] or left <= laplace.rollouts or self.is_late):
                     raise
             rollouts += laplace.rollouts
             ahead = part is None or (found and found[-1][0].evidence >= part.evidence - _UNNEEDED)
-            if ahead or (found and time.monotonic() > self.ends):
+            if ahead or (found and self.is_late):
                 break
         (evidence, pieces), best = max(found, key=lambda one: (one[1].finding is None, one[0].evidence))
         assert best.starts is not None
@@ -190,7 +195,7 @@ class Fitting:
             evidence,
             pieces,
             rollouts + windows.rollouts,
-            best.finding is None,
+            best.finding is None and (ahead or not self.is_late),  # else its part's optimum is still to be tried
         )
 
     @staticmethod

@@ -20,6 +20,7 @@ that gains less than eight in the end is never clear of its own standard error.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,7 +28,7 @@ from dataclasses import replace
 import numpy as np
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.core.budget import BudgetExhausted, BudgetTooSmall, Deadline
+from sipe_bayes.core.budget import BudgetExhausted, BudgetTooSmall
 from sipe_bayes.core.telling import Tell, silent
 from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood import BoundLikelihood, QuadraticPrior
@@ -99,7 +100,7 @@ class StructureSearch:
     @property
     def is_late(self) -> bool:
         """Whether the time limit has passed."""
-        return time.monotonic() > self.fitting.ends
+        return self.fitting.is_late
 
     def _ends_late(self, state: DiscoverState) -> bool:
         """Whether the next fit would end after the time limit, if it takes as long as the longest one until now."""
@@ -138,7 +139,8 @@ class StructureSearch:
                 quick = self.fitting.windows(self.fitting.simulator([p for p in own if p.extension.slow == 1]))
                 quick.rollouts, quick.budget, quick.deadline = windows.rollouts, windows.budget, windows.deadline
                 lin = replace(quick.linearise(one.theta, one.starts), residual=residual)
-                windows = quick
+                whole.rollouts = quick.rollouts
+                windows, lin = (quick, lin) if lin.valid else (whole, None)
             taken = {*one.labels, *(t for p in own for q in p.parameters for t in q.targets)}
             every = self._placed.values()
             rest = [p for p in every if not taken & {p.label, *(t for q in p.parameters for t in q.targets)}]
@@ -193,9 +195,8 @@ class StructureSearch:
     def _plain(self, state: DiscoverState) -> DiscoverState:
         """The nominal model fitted."""
         budget = min(self.enough([]), int(self.options.plain_share * self.budget))
-        plain = self.fitting.fit([], None, max(budget, 1), self._tell)
-        cut = Phase.PLAIN if self.is_late and not plain.settled else None
-        return replace(state, fitted=(plain,), phase=Phase.RANK, cut=cut)
+        plain = replace(self.fitting, ends=math.inf).fit([], None, max(budget, 1), self._tell)
+        return replace(state, fitted=(plain,), phase=Phase.RANK)
 
     def _rank(self, state: DiscoverState) -> DiscoverState:
         """Predicted gains beside one structure of the beam; or which structures are to be fitted."""
@@ -237,7 +238,6 @@ class StructureSearch:
         """The state with predicted gains beside a structure, best first; cut where the budget ends."""
         windows = self.fitting.windows(self.fitting.simulator(self.structure(here.labels)))
         windows.budget, ranked, cut = max(self.budget - state.rollouts, 0), list[Candidate](), None
-        windows.deadline = Deadline(self.fitting.ends)
         try:
             ranked = rank_candidates(self.linear_model(here, lambda what: self._tell(what, windows.rollouts), windows))
         except BudgetExhausted:
@@ -330,7 +330,7 @@ class StructureSearch:
             self._longest = max(self._longest, (time.monotonic() - began) / self._slowness(labels))
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
             spent = state.failed_rollouts + self._fit_rollouts
-            cut = cut if isinstance(error, BudgetTooSmall) else None
+            cut = (state.phase if self.is_late else cut) if isinstance(error, BudgetTooSmall) else None
             return replace(state, failed=(*state.failed, labels), failed_rollouts=spent, cut=cut)
         if one.settled:
             return replace(state, fitted=(*state.fitted, one))

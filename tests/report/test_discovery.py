@@ -123,7 +123,7 @@ NEXT = {
     "found": (make_discovery(FRICTION), "sipe calibrate runs/pendulum-discover/discovered.toml"),
     "nothing": (make_discovery(), "go on with the configuration"),
     "nothing, wrong": (changed(**left(LARGE)), "structure.extra"),
-    "nothing tried": (changed(**left(LARGE), findings=(CUT,)), "with a larger budget"),
+    "nothing tried": (changed(**left(LARGE), findings=(CUT,)), "the search again, as said above"),
 }
 
 

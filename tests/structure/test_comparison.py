@@ -164,7 +164,7 @@ def test_an_interval_reaches_as_far_as_the_optimum(theta: float, wide: bool) -> 
 def test_a_fit_that_was_cut_short_below_its_own_part_says_nothing(evidence: float, settled: bool, kept: bool) -> None:
     """It may have more evidence than it had on the way, not less than with one fewer; it is not tried again."""
     one = replace(structure("ab", evidence=evidence), settled=settled, rollouts=70)
-    fitting: Any = SimpleNamespace(ends=np.inf, enough=lambda placed: 90, fit=lambda *given: one)
+    fitting: Any = SimpleNamespace(is_late=False, ends=np.inf, enough=lambda placed: 90, fit=lambda *given: one)
     search = StructureSearch(fitting, (), budget=10_000)
     begun = DiscoverState(Phase.FIT, (structure(""), structure("a", evidence=100.0)))
     with mock.patch.object(search, "structure", return_value=[]):

@@ -212,7 +212,7 @@ class SegmentSolver:
 
     @property
     def step_rollouts(self) -> int:
-        """Rollouts that a step takes at most."""
+        """Rollouts that a step takes, but for shorter changes of initial states, which need not be tried."""
         windows = self.windows
         return (windows.num_theta + windows.num_start + len(_DAMPINGS) + 1) * len(windows.trajectories)
 
@@ -695,7 +695,7 @@ class SegmentSolver:
             best, values = best_step(stacked, all_starts, residuals, valid, energy, now, 0.1 * tolerance)
         damping = float(here.damping * _DAMPINGS[best])
         gained = now - float(values[best])
-        held = np.where(shares[best] < 1, np.maximum(10 * held, 1.0), np.where(held > 0.1, 0.1 * held, 0.0))
+        held = np.where(shares[best] < 1, np.clip(10 * held, 1.0, 1e4), np.where(held > 0.1, 0.1 * held, 0.0))
         return _Trial(stacked[best], all_starts[best], residuals[best], gained, expected, damping, held), scale
 
     def _leaves_no_room(self) -> bool:
@@ -1008,14 +1008,14 @@ def shorter_starts(
     """
     tried = starts + _SHARES[:, None, None, None] * changes
     shape, flat = tried.shape[:2], tried.reshape(-1, *starts.shape)
-    more, good = view.residuals(np.tile(thetas, (len(_SHARES) - 1, 1)), flat[len(thetas) :])
-    residuals, valid = np.concatenate([residuals, more]), np.concatenate([valid, good])
+    predicted, _ = view.predict(np.tile(thetas, (len(_SHARES) - 1, 1)), flat[len(thetas) :])
+    more = np.where(view.observed, view.measured - predicted, 0.0)  # not finite where a segment diverges
+    residuals = np.concatenate([np.where(valid[:, None, None, None], residuals, np.nan), more])
     energies = view.energies(flat, residuals, noise)
-    energies[~valid] = np.inf
-    best = energies.reshape(*shape, -1).argmin(0)
-    rows, segments = np.arange(shape[1])[:, None], np.arange(len(starts))
-    residuals, whole = residuals.reshape(*shape, *residuals.shape[1:]), np.asarray(valid.reshape(shape).any(0))
-    return tried[best, rows, segments], residuals[best, rows, segments], whole, _SHARES[best]
+    energies = np.where(np.isfinite(energies), energies, np.inf).reshape(*shape, -1)
+    best, rows, segments = energies.argmin(0), np.arange(shape[1])[:, None], np.arange(len(starts))
+    residuals, whole = residuals.reshape(*shape, *residuals.shape[1:]), np.isfinite(energies.min(0)).all(1)
+    return tried[best, rows, segments], residuals[best, rows, segments], np.asarray(whole), _SHARES[best]
 
 
 def best_step(

@@ -168,7 +168,7 @@ def next_steps(discovery: Discovery) -> str:
         onward = f"sipe calibrate {out / 'discovered.toml'} (the model with these values: {out / 'discovered.xml'})"
         return onward + alone * bool(alternatives(discovery))
     if cut_short(discovery):
-        return "search again with a larger budget, as said above"
+        return "run the search again, as said above"
     if discovery.passes:
         return "nothing to put in; go on with the configuration as it is"
     return (
