@@ -1,7 +1,10 @@
 """Is an estimator calibrated? Many truths drawn from the prior, a posterior for each.
 
 Three transforms of (posterior, truth) are uniform on [0, 1] when the posteriors are right; each is compared with
-uniform by the test of Kolmogorov and Smirnov, with its simultaneous band.
+uniform by the largest deviation of the empirical distribution on 99 levels, as the binomial tail probability there,
+calibrated by simulation, with the simultaneous band of T. Sailynoja, P.-C. Burkner, A. Vehtari 2022,
+https://arxiv.org/abs/2103.10522. (Kolmogorov and Smirnov's test sees too little in the tails: it missed posteriors of
+twice the width in 40 logs.)
 
 - Ranks u_j = P(theta_j < theta*_j), by parameter: simulation-based calibration (S. Talts, M. Betancourt, D. Simpson,
   A. Vehtari, A. Gelman 2018, https://arxiv.org/abs/1804.06788). They see shift and width.
@@ -20,6 +23,7 @@ distribution be right.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -37,6 +41,7 @@ from sipe_bayes.posterior import Posterior
 Verdict = Literal["calibrated", "too narrow", "too wide", "shifted"]
 
 LEVELS = np.arange(1, 100) / 100
+_SIMULATED = 4000  # samples of the null: p resolves a quarter of a thousandth
 FEWEST = 20  # pairs: fewer show nothing at the level of the check
 
 
@@ -219,10 +224,33 @@ def tarp_values(
 
 def uniformity(values: FloatArray) -> Uniformity:
     """Compare values (R,) in [0, 1] with uniform."""
-    curve = np.searchsorted(np.sort(values), LEVELS, side="right") / len(values)
-    margin = float(scipy.stats.kstwo.isf(THRESHOLDS.miscalibrated, len(values)))
-    low, high = np.clip(LEVELS - margin, 0, 1), np.clip(LEVELS + margin, 0, 1)
-    return Uniformity(values, curve, low, high, float(scipy.stats.kstest(values, "uniform").pvalue))
+    count = len(values)
+    below = np.searchsorted(np.sort(values), LEVELS, side="right")
+    tails, smallest = _null(count)
+    least = tails[np.arange(len(LEVELS)), below].min()
+    simulated = (1 + int((smallest <= least).sum())) / (1 + len(smallest))
+    p = min(simulated, 2 * len(LEVELS) * float(least))  # Bonferroni's bound reaches below what simulation resolves
+    inside = tails >= np.quantile(smallest, THRESHOLDS.miscalibrated)
+    low = inside.argmax(1) / count
+    high = (count - inside[:, ::-1].argmax(1)) / count
+    return Uniformity(values, below / count, low, high, p)
+
+
+@functools.lru_cache(maxsize=8)
+def _null(count: int) -> tuple[FloatArray, FloatArray]:
+    """Binomial tail probabilities (L, count + 1), the smaller side, of so many values at or below each level.
+
+    With them their least over the levels in simulations of uniform values.
+    """
+    k = np.arange(count + 1)
+    level = LEVELS[:, None]
+    tails = np.minimum(scipy.stats.binom.cdf(k, count, level), scipy.stats.binom.sf(k - 1, count, level))
+    rng = np.random.default_rng(count)
+    smallest = np.empty(_SIMULATED)
+    for i in range(_SIMULATED):
+        below = np.searchsorted(np.sort(rng.random(count)), LEVELS, side="right")
+        smallest[i] = tails[np.arange(len(LEVELS)), below].min()
+    return tails, smallest
 
 
 def _lean(seen: Uniformity) -> float:

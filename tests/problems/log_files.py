@@ -211,7 +211,8 @@ def ulog_file(folder: Path, table: Table) -> Written:
         parts.append(record("D", struct.pack("<HQf4xdd", 0, time, 0.25, 0.0, q)))
         parts += [record("D", struct.pack("<HQd", i, time, value)) for i, value in ((1, 0.0), (2, u))]
     (folder / "log.ulg").write_bytes(b"".join(parts))
-    ULog(str(folder / "log.ulg")).write_ulog(str(folder / "log.ulg"))
+    if (np.diff(table["t"]) > 0).all():  # pyulog sorts
+        ULog(str(folder / "log.ulg")).write_ulog(str(folder / "log.ulg"))
     return Written(folder / "log.ulg", {"t": "time", "q": "joint.angle[1]", "u": "motor[1].effort"})
 
 
