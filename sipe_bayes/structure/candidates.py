@@ -45,9 +45,7 @@ def rank_candidates(logs: AugmentedModel) -> list[Candidate]:
     The noise is estimated anew for the ``_ESTIMATED`` shapes of the largest gains at the noise of the fit.
     """
     ends = np.cumsum([len(effect.probes) for effect in logs.effects])
-    shapes = [
-        (effect, np.arange(end - len(effect.probes), end)) for effect, end in zip(logs.effects, ends, strict=True)
-    ]
+    shapes = [(one, np.arange(end - len(one.probes), end)) for one, end in zip(logs.effects, ends, strict=True)]
     rough = [_candidate(logs, *shape, 0.0, logs.fitted_at_noise) for shape in shapes]
     plain = logs.fitted(np.zeros(0, int)).level
     ranked, best = dict[str, Candidate](), sorted(range(len(rough)), key=lambda k: -rough[k].gain)

@@ -52,7 +52,6 @@ def test_truths_are_held_where_the_model_lacks_dry_friction(logs: int) -> None:
     recorded = [log(pendulum(FRICTION), [*truth, 0.04], seed, name=f"log {seed}") for seed in range(2, 2 + logs)]
     seen, plain, wide = of_logs(recorded)
     theta = pendulum().space.normalise(truth)
-    print(theta, plain, wide, seen.causes)
     assert not plain[0, 1] <= theta[1] <= plain[1, 1]
     assert ((wide[0] <= theta) & (theta <= wide[1])).all()
     assert any("friction" in cause for cause in seen.causes)
@@ -73,7 +72,6 @@ def test_a_parameter_that_was_driven_to_its_bound_comes_away_from_it() -> None:
     recorded = [log(pendulum(DELAY), [*truth, 0.06], seed, name=f"log {seed}") for seed in (2, 3)]
     seen, plain, wide = of_logs(recorded)
     theta = pendulum().space.normalise(truth)
-    print(theta, plain, wide, seen.causes)
     assert plain[1, 1] < theta[1]
     assert not seen.at.logs.seen.free[1]
     assert ((wide[0] <= theta) & (theta <= wide[1])).all()
@@ -119,7 +117,6 @@ def test_sds_are_the_scatter_whether_samples_remember_or_not(memory: float) -> N
         plain.append(np.sqrt(np.diag(logs.seen.projected.covariance)))
         discounted.append(np.sqrt(np.diag(logs.seen.discounted.projected.covariance)))
     told, ratio = (np.std(steps, axis=0) / np.mean(sds, axis=0) for sds in (discounted, plain))
-    print(told, ratio)
     assert ((told > 0.6) & (told < 1.5)).all()
     assert (ratio > 2.5).all() if memory > 1 else (ratio < 1.3).all()
 

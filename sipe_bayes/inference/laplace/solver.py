@@ -686,12 +686,13 @@ class SegmentSolver:
             thetas.append(theta)
             changes.append(solved.blocks(move))
         stacked, moved = np.stack(thetas), np.stack(changes)
-        residuals, valid = view.residuals(stacked, starts + moved)
         all_starts, shares = starts + moved, np.ones(moved.shape[:2])
+        residuals, valid = view.residuals(stacked, all_starts)
         best, values = best_step(stacked, all_starts, residuals, valid, energy, now, 0.1 * tolerance)
-        if view.num_start and now - values[best] < _FORETOLD * expected and view.has_room(2 * len(thetas)):
-            made = shorter_starts(view, noise, stacked, starts, moved, residuals, valid)
-            all_starts, residuals, valid, shares = made
+        surprised = now - values[best] < _FORETOLD * expected and not self._beginnings  # impacts surprise always
+        if view.num_start and surprised and view.has_room(2 * len(thetas)):
+            given = view, noise, stacked, starts, moved, residuals, valid
+            all_starts, residuals, valid, shares = shorter_starts(*given)
             best, values = best_step(stacked, all_starts, residuals, valid, energy, now, 0.1 * tolerance)
         damping = float(here.damping * _DAMPINGS[best])
         gained = now - float(values[best])

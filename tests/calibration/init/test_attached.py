@@ -61,7 +61,6 @@ def test_what_is_attached_is_offered(tmp_path: Path) -> None:
     unknowns = {unknown.name: unknown for unknown in draft.parameters}
     assert "attached to lower" in unknowns["tool_mass"].note
     asked = {unknown.name for unknown in draft.free}
-    print({name: unknown.left_out for name, unknown in unknowns.items()})
     assert {"upper_mass", "lower_mass"} <= asked
     assert not [doubt for doubt in draft.doubts if "no force is known" in doubt]
 

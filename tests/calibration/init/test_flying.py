@@ -54,7 +54,6 @@ def flown(folder: Path, late: int, unit: str) -> Draft:
 def test_a_delay_of_what_flies_and_two_masses_that_look_alike(tmp_path: Path, late: int) -> None:
     draft = flown(tmp_path, late, "N")
     left_out = {unknown.name: unknown.left_out for unknown in draft.parameters}
-    print(draft.delay, left_out)
     assert round(draft.delay) == late
     assert ("delay" in left_out) == (late > 0)
     assert not left_out["base_mass"]
@@ -64,7 +63,6 @@ def test_a_delay_of_what_flies_and_two_masses_that_look_alike(tmp_path: Path, la
 def test_forces_that_are_known_by_no_unit_are_relative_to_a_mass(tmp_path: Path) -> None:
     draft = flown(tmp_path, 4, "V")
     left_out = {unknown.name: unknown.left_out for unknown in draft.parameters}
-    print(draft.delay, left_out)
     assert round(draft.delay) == 4
     assert RELATIVE in (left_out["base_mass"], left_out["payload_mass"])
     (gain,) = (unknown for unknown in draft.parameters if unknown.name == "rotors_gain")

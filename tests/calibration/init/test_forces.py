@@ -79,6 +79,7 @@ def test_rotors_that_the_model_lacks_are_free_and_no_delay(tmp_path: Path) -> No
     [
         ({"shoulder": 40.0, "elbow": 40.0}, "effort_{}", "times as large"),  # shares of a largest, or counts
         ({"shoulder": 2.0, "elbow": 2.0}, "effort_{}_A", "A is no unit of a force"),
+        ({"shoulder": 0.0, "elbow": 0.0}, "tau_measured_{}", "% of its variance"),  # noise
         ({"shoulder": 1.0, "elbow": 1.0}, "torque_cmd_{}", "not used: torque_cmd_shoulder, torque_cmd_elbow"),
     ],
 )

@@ -45,7 +45,6 @@ def test_the_mass_of_a_free_body(tmp_path: Path, driven: bool) -> None:
     logs = pd.DataFrame(rows, columns=names)
     (logs if driven else logs.drop(columns="push_N")).to_csv(tmp_path / "log.csv", index=False)
     unknowns = [unknown.name for unknown in propose(path, [tmp_path / "log.csv"], tmp_path).parameters]
-    print(unknowns)
     assert ("puck_mass" in unknowns) == driven
     assert "puck_friction" in unknowns
 
@@ -82,7 +81,6 @@ def test_in_noise_names_stand_and_nothing_is_odd(tmp_path: Path) -> None:
     path = tmp_path / "calibrate.toml"
     path.write_text(toml_of(draft, "sipe init"))
     result = CliRunner().invoke(app, ["validate", str(path)])
-    print(result.output)
     assert result.exit_code == 0
     assert "nothing is odd" in result.output
 
@@ -175,5 +173,4 @@ def test_a_pose_without_columns_is_told(tmp_path: Path, geom: str, said: str) ->
     columns = {"t": time, "puck_x_m": 0.1 * time, "puck_y_m": 0.2 * time, "puck_z_m": 0.02 + 1e-4 * np.sin(time)}
     pd.DataFrame(columns).to_csv(tmp_path / "log.csv", index=False)
     draft = propose(path, [tmp_path / "log.csv"], tmp_path)
-    print(draft.open_doubts)
     assert any(f"no column measures puck.orientation, {said}:" in line for line in summary(draft, "calibrate.toml"))

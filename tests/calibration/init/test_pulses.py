@@ -55,7 +55,6 @@ def test_pulses_become_shares_of_the_ctrlrange(
     _record(tmp_path, limits, 6 if span > 1 else 0.01, column, pulses, actions)
     draft = propose(tmp_path / "cart.xml", [tmp_path / "log.csv"], tmp_path, None)
     (command,) = draft.commands
-    print(command)
     assert (command.zero, command.supply, command.sign) == (zero, None, 1)
     assert command.factor == pytest.approx(1 / span)
     assert not any("outside of the ctrlrange" in doubt for doubt in draft.open_doubts), draft.open_doubts

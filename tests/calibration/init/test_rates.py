@@ -102,6 +102,14 @@ def test_degrees_or_radians_of_both_are_left_to_simulations(tmp_path: Path) -> N
     assert (readings["luff"].sign, readings["slew"].sign) == (1, 1)
 
 
+def test_counts_that_nobody_uses_are_told(tmp_path: Path) -> None:
+    """Behind a gear of 7."""
+    columns = counted(moved(0.0), 28672, 28672)
+    felt(columns, 1.0)
+    draft = proposed(tmp_path, columns)
+    assert any("look at" in doubt or "how is it mounted?" in doubt for doubt in draft.open_doubts), draft.open_doubts
+
+
 def test_without_a_gyro_simulations_alone_tell(tmp_path: Path) -> None:
     draft = proposed(tmp_path, counted(moved(0.0), 20000, 20000), sensor="")
     assert not any("gyro" in text for r in draft.readings for text in (*r.notes, *r.doubts))

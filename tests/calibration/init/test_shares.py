@@ -15,7 +15,7 @@ from sipe_bayes.calibration.init.matching import match_columns
 from sipe_bayes.calibration.init.propose import propose
 from sipe_bayes.calibration.init.readings import BOTH_WAYS, PERCENT, first_readings
 from sipe_bayes.calibration.init.tables import Clock
-from sipe_bayes.calibration.init.write import summary, toml_of
+from sipe_bayes.calibration.init.write import toml_of
 from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.calibration.machine import Machine
 from sipe_bayes.core.arrays import FloatArray
@@ -137,7 +137,6 @@ def test_what_simulations_do_not_tell_is_open_with_the_other_written_out(tmp_pat
     pd.DataFrame(columns).to_csv(tmp_path / "log.csv", index=False)
     draft = propose(tmp_path / "arm.xml", [tmp_path / "log.csv"], tmp_path)
     text = toml_of(draft, "sipe init")
-    print(text, *summary(draft, "calibrate.toml"), sep="\n")
     gripper = next(reading for reading in draft.measurements if "gripper" in reading.match.target)
     assert gripper.ends == PERCENT, "as LeRobot has it"
     assert text.count('unit = "rad"\nfactor = 0.0192\nzero = 8.85417\n') == 2

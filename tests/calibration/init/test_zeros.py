@@ -119,7 +119,6 @@ def test_the_zero_of_what_hangs_from_a_cart_that_the_model_has_wrong(tmp_path: P
     (tmp_path / "crane.xml").write_text(CRANE.format(damping=1.0, dry=0.5, cart=2.0, bob=0.45))
     by_target = {r.match.target: r for r in propose(tmp_path / "crane.xml", logs, tmp_path).measurements}
     angle = by_target["joint:pivot.position"]
-    print(angle.zero, angle.sign, angle.unit)
     assert (angle.match.column, angle.sign, angle.unit) == ("winkel", 1, "deg")
     assert abs(angle.zero - zero) < 3
 
