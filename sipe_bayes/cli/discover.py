@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sipe_bayes.inference.recorded import Progress
 
 _WIDTH = 58  # of what a structure has
-TIME_LIMIT = 200.0  # s; with the comparison and the report five minutes
+TIME_LIMIT = 200.0  # s; the comparison and the report of an arm with six joints take another minute
 _TRIED, _ERRORS, _VALUES = 5, 2, 3  # lines of each kind that are printed: twenty in all
 _TONES = {"good": "green", "fair": "yellow", "bad": "bold red"}  # on a terminal
 
