@@ -138,9 +138,7 @@ class Laplace(Estimator[LaplaceState]):
     def step(self, state: LaplaceState, trajectories: Trajectories) -> LaplaceState:
         """A step of the search, or, where it has ended, one more batch of draws."""
         windows = self.bound(trajectories)
-        known = (
-            state.search.optima or self.initial_starts is not None
-        )  # where nothing is known yet it has the time it needs
+        known = state.search.optima or self.initial_starts is not None  # else the first estimate has the time it needs
         windows.deadline = self._deadline if known else Deadline()
         if state.draws is not None and isinstance(windows, Windows):
             assert isinstance(state.search, WindowState)
