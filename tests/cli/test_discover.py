@@ -111,7 +111,7 @@ def test_a_time_limit_ends_a_search_with_what_it_has(
     with pytest.raises(SystemExit, match="0"):
         main()
     shown = " ".join(capsys.readouterr().out.split())
-    assert "the search ended at its time limit before the model as it is was fitted to the end" in shown
+    assert "the search ended at its time limit before what the model may lack was ranked" in shown
     assert "give a longer --time-limit, and the same folder goes on" in shown
 
 
