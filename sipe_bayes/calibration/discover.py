@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sipe_bayes.calibration.checks.followed import not_followed
 from sipe_bayes.calibration.discovered import write_discovery
-from sipe_bayes.calibration.discovery_summary import summarise
+from sipe_bayes.calibration.discovery_summary import summarise, without_worse
 from sipe_bayes.calibration.output import CHECKPOINT, IDENTITY, claimed, describe_run
 from sipe_bayes.calibration.problem import Problem, prepare
 from sipe_bayes.calibration.run import run_name
@@ -168,6 +168,7 @@ def run_discovery(
                 progress(f"comparing before and after: {what}", structures.rollouts, structures.rollouts)
 
         try:
+            structures = without_worse(problem, structures, tell)
             discovery = summarise(problem, structures, name, chosen, began, tell)
             findings = (*unexplained, *discovery.findings)
             discovery = replace(discovery, findings=findings, run=record, out=str(folder))

@@ -53,6 +53,20 @@ _BEFORE = {
 """What a search whose budget was spent did not come to, by what it was doing."""
 
 
+def without_worse(problem: Problem, structures: Structures, tell: Tell = silent) -> Structures:
+    """With the set without those of which the one to be written has larger errors on held-out logs than the plain model.
+
+    Larger by more than one standard error, from the initial states that each model fits best.
+    """
+    while structures.best is not structures.plain:
+        after, before = (_Model(problem, structures, one, tell) for one in (structures.best, structures.plain))
+        comparison = _comparison(problem, before, after)
+        if comparison is None or not comparison.falls_behind:
+            break
+        structures = replace(structures, refused=(*structures.refused, structures.best.labels))
+    return structures
+
+
 def summarise(
     problem: Problem, structures: Structures, name: str, seed: int, began: float, tell: Tell = silent
 ) -> Discovery:

@@ -76,6 +76,11 @@ class Comparison:
         """``better``, ``not better`` or ``worse``."""
         return "not better" if self.p > THRESHOLDS.comparison else "better" if self.ratio > 1 else "worse"
 
+    @property
+    def falls_behind(self) -> bool:
+        """Whether the errors are larger by more than one standard error."""
+        return self.ratio < 1 and self.p < 2 * float(scipy.stats.norm.sf(1))
+
 
 @dataclass(frozen=True)
 class Signal:

@@ -10,14 +10,22 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.budget import BudgetTooSmall
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace import EVIDENCE_TUNING, Laplace
 from sipe_bayes.inference.recorded import Progress
-from sipe_bayes.likelihood import BoundLikelihood, FitResult, Noise, QuadraticPrior, Segments
+from sipe_bayes.likelihood import (
+    FLAT_PRECISION,
+    BoundLikelihood,
+    FitResult,
+    Linearisation,
+    Noise,
+    QuadraticPrior,
+    Segments,
+)
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
@@ -197,6 +205,35 @@ class Fitting:
             rollouts + windows.rollouts,
             best.finding is None and (ahead or not self.is_late),  # else its part's optimum is still to be tried
         )
+
+    def needs(self, placed: Sequence[Placed], one: FittedStructure) -> tuple[dict[str, float], int]:
+        """By how many nats a structure would fit worse without each extension, and rollouts that were taken.
+
+        All else follows to first order, from a simulation without it. Of one without parameters nothing is known: zero.
+        """
+        windows = self.windows(self.simulator(placed))
+        prior = QuadraticPrior.of(self.prior_of(windows.simulator))
+        lin, n, first = windows.linearise(one.theta, one.starts), windows.num_theta, len(self.prior.space)
+
+        def square(residual: FloatArray, keep: IntArray) -> float:
+            columns = np.append(keep, np.arange(n, lin.jacobian.shape[-1]))
+            moments = windows.moments(Linearisation(residual, lin.jacobian[..., columns], True))
+            normal = moments.normal(one.noise)
+            arrow = windows.eliminate(normal, len(keep), one.starts)
+            belief = (prior.precision + FLAT_PRECISION * np.eye(n))[np.ix_(keep, keep)]
+            step = np.linalg.solve(arrow.precision + belief, arrow.gradient)
+            return float(normal[:, -1, -1].sum()) - arrow.explained - float(arrow.gradient @ step)
+
+        out, whole = dict[str, float](), square(lin.residual, np.arange(n))
+        for piece in placed:
+            own = np.arange(first, first + len(piece.parameters))
+            first += len(own)
+            theta = one.theta.copy()
+            theta[own] = piece.plain
+            (residual,), (valid,) = windows.residuals(theta[None], one.starts[None])
+            left = square(residual, np.setdiff1d(np.arange(n), own)) if valid else math.inf
+            out[piece.label] = 0.5 * (left - whole) if len(own) else 0.0
+        return out, windows.rollouts
 
     @staticmethod
     def _scores(windows: BoundLikelihood, best: FitResult, prior: Posterior) -> Scores:

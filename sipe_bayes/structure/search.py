@@ -1,4 +1,4 @@
-r"""The search over structures: what fits best is extended, round by round; then each extension is left out once.
+r"""The search over structures: what fits best is extended, round by round; then extensions are left out one by one.
 
 **Steps** (``StructureSearch``), one of them a call of ``step``::
 
@@ -7,7 +7,7 @@ r"""The search over structures: what fits best is extended, round by round; then
     RANK    score tests of all extensions, beside each structure of the beam
       |  something has a predicted gain        nothing has
       v                                           v
-    FIT     the best few, one a step           PRUNE   each extension of the best structure left out once
+    FIT     the best few, one a step           PRUNE   the least needed extension of the best structure left out
       |  some are clearly better                  v
       +--> RANK, with these as the beam         DONE
          none is: PRUNE
@@ -157,14 +157,17 @@ class StructureSearch:
         """The extensions wherever the machine has a place for them, after the first step."""
         return self._placed
 
-    def supported(self, state: DiscoverState) -> list[FittedStructure]:
-        """The set that the logs support: ties, the simplest one first, of native elements where these do as well."""
+    def supported(self, state: DiscoverState, refused: Sequence[tuple[str, ...]] = ()) -> list[FittedStructure]:
+        """The set that the logs support: ties, the simplest one first, of native elements where these do as well.
+
+        refused: labels of structures that are not to be in it.
+        """
 
         def simple(one: FittedStructure) -> tuple[int, bool, float]:
             native = all(self._placed[label].extension.native for label in one.labels)
             return len(one.labels), not native, -rank(one)[1]
 
-        return sorted(choose_ties(self._counted(state)), key=simple)
+        return sorted(choose_ties([one for one in self._counted(state) if one.labels not in refused]), key=simple)
 
     def _counted(self, state: DiscoverState) -> list[FittedStructure]:
         """Those fitted to the end that predict held-out logs not worse than the plain model by a standard error."""
@@ -291,12 +294,19 @@ class StructureSearch:
         return tuple(one.labels for one in sorted(better, key=rank, reverse=True)[: self.options.beam])
 
     def _prune(self, state: DiscoverState) -> DiscoverState:
-        """The best structure without one of its extensions, from where it ended itself."""
+        """The best structure without the extension that it needs least, from where it ended; until one is needed."""
         best = max(self._counted(state), key=rank)
-        for left_out in best.labels:
+        needs = dict.fromkeys(best.labels, 0.0)
+        if len(best.labels) > 1:
+            needs, spent = self.fitting.needs(self.structure(best.labels), best)
+            state = replace(state, rank_rollouts=state.rank_rollouts + spent)
+        for left_out in sorted(best.labels, key=lambda label: needs[label]):
             labels = tuple(label for label in best.labels if label != left_out)
             if labels not in state.pruned and labels not in state.failed:
                 return self._without(state, best, labels)
+            without = state.of(labels)
+            if without is not None and difference(best, without).clear and needs[left_out]:
+                break
         return replace(state, phase=Phase.DONE)
 
     def _without(self, state: DiscoverState, one: FittedStructure, labels: tuple[str, ...]) -> DiscoverState:

@@ -111,7 +111,7 @@ class DiscoverState:
             Phase.PLAIN: "fitting the model as it is",
             Phase.RANK: f"testing {extensions} extensions{beside}",
             Phase.FIT: f"fitting {' and '.join(self.queue[0]) if self.queue else ''}",
-            Phase.PRUNE: "leaving out each extension once",
+            Phase.PRUNE: "leaving out what the best structure needs least",
             Phase.DONE: "done",
         }[self.phase]
 

@@ -36,6 +36,7 @@ class StructureRow:
         tied: whether it is of that set: structures that the logs do not tell apart.
         weight: in the stacked predictions; zero outside the set that the logs support.
         rollouts: that its fit took.
+        refused: whether it is not written out, since its errors on held-out logs are larger.
     """
 
     sentences: tuple[str, ...]
@@ -48,6 +49,7 @@ class StructureRow:
     tied: bool
     weight: float
     rollouts: int
+    refused: bool = False
 
 
 @dataclass(frozen=True)
@@ -57,10 +59,12 @@ class Structures:
     Args:
         search: that fitted them.
         state: where it ended.
+        refused: labels of structures that are not written out, since their errors on held-out logs are larger.
     """
 
     search: StructureSearch
     state: DiscoverState
+    refused: tuple[tuple[str, ...], ...] = ()
 
     @property
     def fitted(self) -> tuple[FittedStructure, ...]:
@@ -97,7 +101,7 @@ class Structures:
     @cached_property
     def supported(self) -> tuple[FittedStructure, ...]:
         """The set that the logs support: structures that they do not tell apart, the simplest one first."""
-        return tuple(self.search.supported(self.state))
+        return tuple(self.search.supported(self.state, self.refused))
 
     @cached_property
     def weights(self) -> FloatArray:
@@ -142,7 +146,7 @@ class Structures:
         for weight, one in zip(self.weights.tolist(), self.fitted, strict=True):
             sentences, evidence = tuple(x.sentence for x in self.placed(one)), one.evidence - self.plain.evidence
             scores = (evidence, *difference(one, self.plain), *difference(self.best, one), one.labels in order, weight)
-            rows.append(StructureRow(sentences, one.labels, *scores, one.rollouts))
+            rows.append(StructureRow(sentences, one.labels, *scores, one.rollouts, one.labels in self.refused))
         return sorted(rows, key=lambda row: (order.get(row.labels, len(order)), -row.gain))
 
     @property

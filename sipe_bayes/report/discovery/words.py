@@ -72,6 +72,8 @@ def headline(discovery: Discovery) -> Verdict:
         best = discovery.rows[0]
         gain = f"the log predictive density rises by {with_error(best.gain, best.error).lstrip('+')} nats"
         return Verdict("good" if discovery.passes else "fair", f"The logs support {kept}: {gain}.")
+    if discovery.passes and cut_short(discovery):
+        return Verdict("fair", "The residuals pass for noise; whether something is lacking was not tried to the end.")
     if discovery.passes:
         return Verdict("good", "Nothing is lacking that these logs would show.")
     if not discovery.pieces and cut_short(discovery):
@@ -116,8 +118,8 @@ def ties(discovery: Discovery) -> Verdict | None:
             [x for x, label in zip(larger.sentences, larger.labels, strict=True) if label not in best.labels]
         )
         gain = with_error(-larger.behind, larger.behind_error)
-        clear = -larger.behind > 2 * larger.behind_error
-        why = "held-out logs are predicted worse with it" if clear else "less than two standard errors"
+        worse = larger.refused or -larger.behind > 2 * larger.behind_error
+        why = "held-out logs are predicted worse with it" if worse else "less than two standard errors"
         texts.append(f"Adding {added} gains {gain} nats: {why}, so it is left out.")
     return Verdict("fair", " ".join(texts)) if texts else None
 
