@@ -100,10 +100,14 @@ def test_stacking_weights_maximise_the_mixture() -> None:
     assert weights == pytest.approx([0.5, 0.5, 0.01], abs=0.01)  # a hundredth at least
 
 
-def search_of(*fitted: FittedStructure) -> tuple[StructureSearch, list[FittedStructure]]:
-    """A search whose fits are those of structures that are given, by their labels; and those that were asked for."""
+def search_of(*fitted: FittedStructure, **needs: float) -> tuple[StructureSearch, list[FittedStructure]]:
+    """A search whose fits are those of structures that are given, by their labels; and those that were asked for.
+
+    needs: nats that each extension is worth to first order, where not one.
+    """
     fitting: Any = SimpleNamespace(
-        ends=np.inf, trajectories=[0], holdout=None, corrected=lambda columns: fitting, simulator=lambda pieces: None
+        ends=np.inf, trajectories=[0], holdout=None, simulator=lambda pieces: None,
+        needs=lambda pieces, one: ({x: needs.get(x, 1.0) for x in one.labels}, 3),
     )
     search, asked = StructureSearch(fitting, ()), list[FittedStructure]()
     named = SimpleNamespace(extension=SimpleNamespace(native=True, slow=1), parameters=(None,))
@@ -136,6 +140,17 @@ def test_a_beam_finds_what_the_first_choice_hides() -> None:
         state = {Phase.RANK: search._rank, Phase.FIT: search._fit, Phase.PRUNE: search._prune}[state.phase](state)
     assert {one.labels for one in asked} >= {("a",), ("c",), ("a", "b"), ("b",)}
     assert [one.labels for one in search.supported(state)] == [("a", "b")]
+
+
+@pytest.mark.parametrize(("b", "asked"), [(12.0, ["ab", "ac"]), (0.05, ["ab", "ac", "bc"])])
+def test_pruning_ends_where_the_least_needed_extension_is_needed(b: float, asked: list[str]) -> None:
+    """c is not; then b is asked for, and a where b is not needed either."""
+    gains = {"abc": 25.1, "ab": 25.0, "ac": 25.0 - b, "bc": 0.0}
+    search, fitted = search_of(*(structure(x, *np.full(10, gain)) for x, gain in gains.items()), a=9.0, b=5.0)
+    state = DiscoverState(Phase.PRUNE, (structure("", *np.zeros(10)), structure("abc", *np.full(10, 25.1))))
+    while state.phase is Phase.PRUNE:
+        state = search._prune(state)
+    assert ["".join(one.labels) for one in fitted] == asked
 
 
 @pytest.mark.parametrize(("held_out", "kept"), [(1.0, "a"), (-1.0, "")])
