@@ -54,7 +54,7 @@ _BEFORE = {
 
 
 def without_worse(problem: Problem, structures: Structures, tell: Tell = silent) -> Structures:
-    """With the set without those of which the one to be written has larger errors on held-out logs than the plain model.
+    """Without structures whose errors on held-out logs are larger than the plain model's, if they were to be written.
 
     Larger by more than one standard error, from the initial states that each model fits best.
     """

@@ -106,7 +106,10 @@ def search_of(*fitted: FittedStructure, **needs: float) -> tuple[StructureSearch
     needs: nats that each extension is worth to first order, where not one.
     """
     fitting: Any = SimpleNamespace(
-        ends=np.inf, trajectories=[0], holdout=None, simulator=lambda pieces: None,
+        ends=np.inf,
+        trajectories=[0],
+        holdout=None,
+        simulator=lambda pieces: None,
         needs=lambda pieces, one: ({x: needs.get(x, 1.0) for x in one.labels}, 3),
     )
     search, asked = StructureSearch(fitting, ()), list[FittedStructure]()
@@ -144,7 +147,7 @@ def test_a_beam_finds_what_the_first_choice_hides() -> None:
 
 @pytest.mark.parametrize(("b", "asked"), [(12.0, ["ab", "ac"]), (0.05, ["ab", "ac", "bc"])])
 def test_pruning_ends_where_the_least_needed_extension_is_needed(b: float, asked: list[str]) -> None:
-    """c is not; then b is asked for, and a where b is not needed either."""
+    """C is not; then b is asked for, and a where b is not needed either."""
     gains = {"abc": 25.1, "ab": 25.0, "ac": 25.0 - b, "bc": 0.0}
     search, fitted = search_of(*(structure(x, *np.full(10, gain)) for x, gain in gains.items()), a=9.0, b=5.0)
     state = DiscoverState(Phase.PRUNE, (structure("", *np.zeros(10)), structure("abc", *np.full(10, 25.1))))
