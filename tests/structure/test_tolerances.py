@@ -157,3 +157,15 @@ def test_a_configuration_says_them_all() -> None:
     given = {"geometry_tolerance": 0.2, "timing_tolerance": 0.3, "step_tolerance": 0.0}
     own = replace(problem, config=problem.config.model_copy(update=given)).tolerances
     assert own == Tolerances(usual(problem.environment.actuators).commands, 0.2, 0.3, 0.0)
+
+
+def test_of_several_numbers_that_no_log_tells_the_one_to_measure_first_is_named() -> None:
+    """A tenth of the motor's gain moves mass and damping further than a twentieth of the rod's reach."""
+    simulator = pendulum(Parameter("armature", 0.0, 0.1, targets=("joint:hinge.armature",)))
+    seen = probed(simulator, simulator.space.normalise(np.array([0.6, 0.08, 0.02]) / GAIN))
+    first, both = "Measure that first: nothing else moves a value as far.", Tolerances({"motor": 0.1}, geometry=0.05)
+    (alone,), (noticed,) = (untold(find_discrepancy(seen, one)) for one in (TOLERANCES, both))
+    assert first not in alone.text
+    gain, rest = noticed.text.split(first)
+    assert "10 % error of the gain of motor" in gain
+    assert "centre of mass of rod" in rest
