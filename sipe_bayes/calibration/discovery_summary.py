@@ -48,7 +48,7 @@ _BEFORE = {
     Phase.PLAIN: "the model as it is was fitted to the end",
     Phase.RANK: "what the model may lack was ranked",
     Phase.FIT: "all extensions with a predicted gain were fitted",
-    Phase.PRUNE: "each extension of the best structure was left out once",
+    Phase.PRUNE: "extensions that the best structure may not need were left out",
 }
 """What a search whose budget was spent did not come to, by what it was doing."""
 
