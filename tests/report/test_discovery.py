@@ -98,9 +98,15 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
         "bad",
         "were fitted to their end; of these, the simplest of the best has",
     ),
-    "cut short": (changed(FRICTION, settled=False, findings=(CUT,)), "bad", "--budget 60000, and the same folder"),
+    "cut short": (
+        changed(FRICTION, settled=False, findings=(CUT,), **left(LARGE)),
+        "bad",
+        "--budget 60000, and the same folder",
+    ),
+    "cut short, noise": (changed(FRICTION, settled=False, findings=(CUT,)), "fair", "printed intervals, though the"),
+    "nothing, cut short": (changed(settled=False, findings=(CUT,)), "fair", "was not tried to the end"),
     "cut short, wider": (
-        changed(FRICTION, settled=False, findings=(CUT,), **widened(make_discovery())),
+        changed(FRICTION, settled=False, findings=(CUT,), **left(LARGE), **widened(make_discovery())),
         "fair",
         "Use values within the intervals",
     ),

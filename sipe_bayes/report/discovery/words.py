@@ -141,6 +141,8 @@ def trust(discovery: Discovery) -> Verdict:
     """Which intervals hold: those stacked over the structures, once residuals pass and the search has settled."""
     cut = cut_short(discovery)
     usable = discovery.kept and discovery.best_settled and any(p.further is not None for p in discovery.parameters)
+    if cut is not None and discovery.passes and discovery.best_settled:
+        return Verdict("fair", f"Values may be trusted within the printed intervals, though {cut}.")
     if cut is not None and usable:
         return Verdict("fair", f"Use values within the intervals with what the model lacks, no narrower: {cut}.")
     if cut is not None:
