@@ -40,7 +40,7 @@ from sipe_bayes.likelihood import Noise, QuadraticPrior, bind
 from sipe_bayes.structure.augmented import AugmentedModel
 from sipe_bayes.structure.discrepancy import find_discrepancy
 from sipe_bayes.structure.extension import WORLD
-from sipe_bayes.structure.extensions.numerics import PhysicsStep
+from sipe_bayes.structure.registry import get_extension
 from sipe_bayes.structure.tolerances import Tolerances
 
 RESULTS = Path(__file__).parent / "results" / "physics_steps.json"
@@ -136,7 +136,7 @@ def one_log(name: str, timestep: float, of_machine: float, seed: int) -> Seen:
     held = [(low <= theta) & (theta <= high) for low, high in ends]
     widths = [high - low for low, high in ends]
     z = (posterior.mean.numpy() - theta) / posterior.stddev.numpy()
-    named = looks.alarm and PhysicsStep().sentence(WORLD) in looks.cause
+    named = looks.alarm and get_extension("physics_step").sentence(WORLD) in looks.cause
     blocked = any(item.severity is Severity.BLOCKING for item in method.findings)
     return Seen(z, held[0], held[1], widths[1] / widths[0], looks.alarm, named, blocked)
 

@@ -6,9 +6,8 @@ mu. When the logs agree it is chi-square, with as many degrees of freedom as the
 itself, less those that they determine together (Cochran's test). Along directions that even together they leave open mu
 keeps within the cube, which makes Q smaller than that at most.
 
-The parameter named is the one whose freedom to differ between logs lowers Q most: the most economical explanation, not
-merely the largest shift. Where even that leaves the logs in disagreement, no single parameter explains it and none is
-named. Each log is left out in turn: where the others agree without one, that one is named.
+The parameter named is the one whose freedom to differ between logs lowers Q most, not merely that of the largest shift;
+none where even that leaves the logs in disagreement. Where the others agree without a log, that one is named.
 """
 
 from __future__ import annotations
@@ -68,10 +67,7 @@ def disagreement(space: ParameterSpace, logs: Sequence[LogEstimate]) -> Finding 
 
 
 def _says(parameter: Parameter, log: str, theta: float, sd: float) -> str:
-    """What a log says of a parameter, in words; a value beyond the bounds stands for something else.
-
-    On a logarithmic scale the sd is half of what lies between the values a sd in theta below and above.
-    """
+    """What a log says of a parameter, in words; the sd is half of what lies between the values a sd below and above."""
     theta = float(np.clip(theta, -1.0, 2.0)) if parameter.scale == "log" else float(theta)  # else 1e99
     value, low, high = (float(parameter.value(x)) for x in (theta, theta - sd, theta + sd))
     width = (high - low) / 2

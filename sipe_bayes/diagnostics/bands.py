@@ -8,7 +8,6 @@ is a quantile of s, at least 0. Samples of one piece of time are not exchangeabl
 quantile is that of K pieces, 0.9 (K + 1) / K.
 
 Deviation: the training logs also gave the estimate, so that their errors are somewhat small where parameters are many.
-What a band holds is measured on held-out logs.
 """
 
 from __future__ import annotations
@@ -59,14 +58,9 @@ def predictive_bands(
 ) -> dict[str, tuple[FloatArray, FloatArray]]:
     """The ends (W, L, C) of 90 % bands of logs by their use, widened by what those of ``train`` show.
 
-    Args:
-        windows: the logs.
-        predicted: (2, W, L, C) at the mode and by what it is compared with.
-        theta: (N,) the mode.
-        posterior: of theta.
-        seed: of its draws.
-        lacking: whether the posterior is the discrepancy-aware one: in which direction predictions are then wrong
-            elsewhere is not known, so that bands are as wide on both sides of the mode.
+    ``predicted`` are (2, W, L, C) at the mode ``theta`` (N,) and by what it is compared with; ``seed`` is of the
+    posterior's draws. Where it is the discrepancy-aware one (``lacking``), it is not known in which direction
+    predictions are wrong elsewhere, and bands are as wide on both sides of the mode.
     """
     narrow = {use: _posterior_band(own, theta, posterior, seed) for use, own in windows.items()}
     if lacking:

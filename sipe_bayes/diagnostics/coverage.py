@@ -3,8 +3,7 @@
 Three transforms of (posterior, truth) are uniform on [0, 1] when the posteriors are right; each is compared with
 uniform by the largest deviation of the empirical distribution on 99 levels, as the binomial tail probability there,
 calibrated by simulation, with the simultaneous band of T. Sailynoja, P.-C. Burkner, A. Vehtari 2022,
-https://arxiv.org/abs/2103.10522. (Kolmogorov and Smirnov's test sees too little in the tails: it missed posteriors of
-twice the width in 40 logs.)
+https://arxiv.org/abs/2103.10522. (Kolmogorov and Smirnov's test sees too little in the tails.)
 
 - Ranks u_j = P(theta_j < theta*_j), by parameter: simulation-based calibration (S. Talts, M. Betancourt, D. Simpson,
   A. Vehtari, A. Gelman 2018, https://arxiv.org/abs/1804.06788). They see shift and width.
@@ -13,12 +12,9 @@ twice the width in 40 logs.)
 - TARP: the posterior's mass nearer to a random reference point than the truth is (P. Lemos, A. Coogan, Y. Hezaveh, L.
   Perreault-Levasseur 2023, https://arxiv.org/abs/2302.03026). It sees the parameters jointly.
 
-Masses are those of draws, a tie or a gap between draws broken at random, which makes them exactly uniform for a right
-posterior; ``sbi.diagnostics`` breaks no ties, so that particles of unequal weights and points pile up, and compares
-TARP's bins as if they were independent draws. TARP's references are uniform in the cube.
-
-A method that returns the prior passes all three: look at contraction too. Draws of an ill-mixed chain fail though their
-distribution be right.
+Masses are those of draws, ties broken at random, which makes them exactly uniform for a right posterior;
+``sbi.diagnostics`` breaks none. TARP's references are uniform in the cube. A method that returns the prior passes all
+three: look at contraction too. Draws of an ill-mixed chain fail though their distribution be right.
 """
 
 from __future__ import annotations
@@ -41,16 +37,14 @@ from sipe_bayes.posterior import Posterior
 Verdict = Literal["calibrated", "too narrow", "too wide", "shifted"]
 
 LEVELS = np.arange(1, 100) / 100
-_SIMULATED = 4000  # samples of the null: p resolves a quarter of a thousandth
 FEWEST = 20  # pairs: fewer show nothing at the level of the check
 
 
 @dataclass(frozen=True)
 class Uniformity:
-    """Values (R,) that should be uniform; p: the probability of a larger deviation.
+    """Values (R,) that should be uniform, and the probability p of a larger deviation.
 
-    ``curve`` (L,) is the share at or below each of ``LEVELS``; the band from ``low`` to ``high`` (L,) holds the whole
-    curve of uniform values in all but one per cent of cases.
+    ``curve`` (L,) is the share at or below each of ``LEVELS``; the band (L,) holds all of it in 99 % of cases.
     """
 
     values: FloatArray
@@ -62,10 +56,7 @@ class Uniformity:
 
 @dataclass(frozen=True)
 class CalibrationCheck:
-    """What R pairs (posterior, truth) say: of each of N parameters, and by TARP of all together.
-
-    ``intervals`` are the levels of the intervals that hold the truth.
-    """
+    """What R pairs (posterior, truth) say: of each of N parameters by ranks and by levels of intervals, and by TARP."""
 
     names: tuple[str, ...]
     ranks: tuple[Uniformity, ...]
@@ -103,12 +94,16 @@ class CalibrationCheck:
         each = all(self.verdict(name) == "calibrated" for name in self.names)
         return each and self.tarp.p >= THRESHOLDS.miscalibrated
 
+    def _wrong(self, checks: tuple[Uniformity, ...]) -> list[tuple[str, Uniformity]]:
+        """Parameters whose check fails, with it."""
+        return [(name, check) for name, check in zip(self.names, checks, strict=True) if check.p < self._alarm]
+
     def sentences(self) -> list[str]:
         """One for the ranks, one for the coverage, one for TARP; each names what is wrong and by how much."""
         level = THRESHOLDS.shown_interval
         least = min(u.p for u in self.ranks)
         ranks = f"ranks: uniform for all parameters (smallest p = {least:.2g}, {self.truths} truths)"
-        if wrong := [pair for pair in zip(self.names, self.ranks, strict=True) if pair[1].p < self._alarm]:
+        if wrong := self._wrong(self.ranks):
             name, worst = min(wrong, key=lambda pair: pair[1].p)
             also = f", and for {len(wrong) - 1} more" if len(wrong) > 1 else ""
             ranks = (
@@ -117,7 +112,7 @@ class CalibrationCheck:
             )
         held = f"{level:.0%} intervals hold the truth {self.coverage(level).mean():.0%} of the time"
         coverage = f"coverage: {held}: as they should (smallest p = {min(u.p for u in self.intervals):.2g})"
-        if wrong := [pair for pair in zip(self.names, self.intervals, strict=True) if pair[1].p < self._alarm]:
+        if wrong := self._wrong(self.intervals):
             name, worst = min(wrong, key=lambda pair: (pair[1].p, -abs(_lean(pair[1]))))
             share = np.mean(worst.values <= level)
             coverage = f"coverage: {held}: {self.verdict(name)}, worst {name} with {share:.0%} (p = {worst.p:.1g})"
@@ -128,23 +123,13 @@ class CalibrationCheck:
 
     def to_dict(self) -> dict[str, object]:
         """Plain data, for JSON."""
-        return {
-            "truths": self.truths,
-            "calibrated": self.calibrated,
-            "sentences": self.sentences(),
-            "parameters": [
-                {
-                    "name": name,
-                    "verdict": self.verdict(name),
-                    "p_ranks": rank.p,
-                    "p_coverage": interval.p,
-                    "coverage": {str(x): float(np.mean(interval.values <= x)) for x in (0.5, 0.9, 0.95)},
-                    "above_median": float(np.mean(rank.values > 0.5)),
-                }
-                for name, rank, interval in zip(self.names, self.ranks, self.intervals, strict=True)
-            ],
-            "tarp": {"p": self.tarp.p},
-        }
+        parameters = []
+        for name, rank, interval in zip(self.names, self.ranks, self.intervals, strict=True):
+            coverage = {str(x): float(np.mean(interval.values <= x)) for x in (0.5, 0.9, 0.95)}
+            row = {"name": name, "verdict": self.verdict(name), "p_ranks": rank.p, "p_coverage": interval.p}
+            parameters.append({**row, "coverage": coverage, "above_median": float(np.mean(rank.values > 0.5))})
+        said = {"truths": self.truths, "calibrated": self.calibrated, "sentences": self.sentences()}
+        return {**said, "parameters": parameters, "tarp": {"p": self.tarp.p}}
 
 
 def check_calibration(
@@ -174,12 +159,8 @@ def check_draws(
     rng = np.random.default_rng(seed)
     ranks = np.stack([mass_below(drawn, truth, rng) for drawn, truth in zip(draws, theta, strict=True)])
     tarp = tarp_values(draws, theta, rng.random(theta.shape), rng)
-    return CalibrationCheck(
-        names,
-        tuple(uniformity(column) for column in ranks.T),
-        tuple(uniformity(np.abs(2 * column - 1)) for column in ranks.T),
-        uniformity(tarp),
-    )
+    intervals = tuple(uniformity(np.abs(2 * column - 1)) for column in ranks.T)
+    return CalibrationCheck(names, tuple(uniformity(column) for column in ranks.T), intervals, uniformity(tarp))
 
 
 def clearly_wrong(ranks: FloatArray) -> bool:
@@ -188,10 +169,9 @@ def clearly_wrong(ranks: FloatArray) -> bool:
     Under right posteriors the truth lies in a 90 % interval, and below the median, as independent coins of .9 and of a
     half fall. Against such a coin of chance p the mixture of all others, e_n = B(k + 1/2, n - k + 1/2) / B(1/2, 1/2) /
     (p^k (1 - p)^(n - k)) for k of n, ever reaches 1 / alpha with probability alpha at most (J. Ville 1939).
-    ``THRESHOLDS.miscalibrated`` is shared out among the 2 N coins of N parameters.
     """
     inside, below = np.abs(2 * ranks - 1) <= THRESHOLDS.shown_interval, ranks < 0.5
-    enough = np.log(2 * ranks.shape[1] / THRESHOLDS.miscalibrated)
+    enough = np.log(2 * ranks.shape[1] / THRESHOLDS.miscalibrated)  # shared out among the coins
     return any(
         max(_evidence(held, THRESHOLDS.shown_interval), _evidence(low, 0.5)) >= enough
         for held, low in zip(inside.T, below.T, strict=True)
@@ -240,14 +220,12 @@ def uniformity(values: FloatArray) -> Uniformity:
 def _null(count: int) -> tuple[FloatArray, FloatArray]:
     """Binomial tail probabilities (L, count + 1), the smaller side, of so many values at or below each level.
 
-    With them their least over the levels in simulations of uniform values.
+    With them their least over the levels in 4000 simulations of uniform values.
     """
-    k = np.arange(count + 1)
-    level = LEVELS[:, None]
+    k, level = np.arange(count + 1), LEVELS[:, None]
     tails = np.minimum(scipy.stats.binom.cdf(k, count, level), scipy.stats.binom.sf(k - 1, count, level))
-    rng = np.random.default_rng(count)
-    smallest = np.empty(_SIMULATED)
-    for i in range(_SIMULATED):
+    rng, smallest = np.random.default_rng(count), np.empty(4000)
+    for i in range(len(smallest)):
         below = np.searchsorted(np.sort(rng.random(count)), LEVELS, side="right")
         smallest[i] = tails[np.arange(len(LEVELS)), below].min()
     return tails, smallest

@@ -14,7 +14,7 @@ from sipe_bayes.structure.structures import StructureRow
 
 @dataclass(frozen=True)
 class Piece:
-    """An extension that was fitted.
+    """An extension that was fitted; ``kind``, ``native`` and ``nearest`` as ``Extension`` has them.
 
     Args:
         label: what tells it from others, as the table of structures has it.
@@ -23,8 +23,6 @@ class Piece:
             rest was not fitted, as its standard ``error``.
         kept: whether the structure that is written out has it.
         tied: whether another structure of the set that the logs support has it.
-        kind: what it is placed at: ``joint``, ``actuator``, ``channel`` (a measurement) or ``world``.
-        native: whether MJCF has an element for it, and the ``nearest`` element where it has none.
     """
 
     label: str
@@ -54,10 +52,9 @@ class Promise:
 
 @dataclass(frozen=True)
 class ModelErrors:
-    """RMSE of one channel of one log in its unit: of the nominal model, before and after.
+    """RMSE of one channel of one log in its unit: of the nominal model, the calibrated plain one, and the written one.
 
-    ``before`` is the plain model, calibrated, ``after`` the structure that is written out, both from measured starts;
-    ``fitted_before`` and ``fitted_after`` are theirs from the starts that each fits best.
+    From measured starts; ``fitted_before`` and ``fitted_after`` are those from the starts that each fits best.
     """
 
     log: str
@@ -82,24 +79,22 @@ class Stage:
 
 @dataclass(frozen=True)
 class Discovery:
-    """The outcome of ``sipe discover``.
+    """The outcome of ``sipe discover``; "written" is the structure that is written out.
 
     Args:
         rows: structures that were fitted, the set that the logs support first.
-        pieces: extensions that were fitted, those that are written out first.
+        pieces: extensions that were fitted, the written ones first.
         promises: what extensions promised at the plain model, best first.
         posterior: of the user's parameters, stacked over the set that the logs support; ``parameters`` sums it up.
         plain_parameters: the posterior under the plain model.
-        added: parameters of the written structure's extensions, stacked over the structures that have them.
-        best: the optimum of the structure that is written out, in units.
+        added: parameters of the written extensions, stacked over the structures that have them.
+        best: the written optimum, in units.
         errors: before and after, held-out logs first.
-        comparison: of the held-out errors after with those before, from the starts that each model fits best; None
-            without both.
-        before, after: what the plain model leaves, and what the structure that is written out leaves.
-        signals: of each log and channel; ``mode`` is the structure, ``default`` the plain model, calibrated.
-        settled: whether every fit that counts converged, and the budget was enough.
+        comparison: of the held-out errors after with those before, from best starts; None without both.
+        before, after: what the plain and the written model leave.
+        signals: of each log and channel; ``mode`` is the written, ``default`` the plain model, calibrated.
+        settled: whether every fit that counts converged, and the budget was enough; ``best_settled`` the written one.
         rollouts: of all fits.
-        best_settled: whether the fit of the structure that is written out converged.
         ended: what cut the search short: its "budget", its "time", or that it was "interrupted"; else nothing.
     """
 
@@ -139,11 +134,10 @@ class Discovery:
 
     def to_dict(self) -> dict[str, object]:
         """As JSON has it, without signals and residuals."""
-        names = ("name", "pieces", "promises", "parameters", "plain_parameters", "added", "best", "errors")
-        more = ("comparison", "settled", "best_settled", "findings", "rollouts", "seconds", "out")
+        names = "name pieces promises parameters plain_parameters added best errors comparison settled best_settled"
         stages = {"before": self.before, "after": self.after}
         return {
-            **{name: plain(getattr(self, name)) for name in (*names, *more)},
+            **{name: plain(getattr(self, name)) for name in (*names.split(), "findings", "rollouts", "seconds", "out")},
             **{name: plain({"noise": one.noise, "misfit": one.misfit}) for name, one in stages.items()},
             "structures": plain(self.rows),
             "warnings": Findings(self.findings).warnings,

@@ -1,8 +1,7 @@
 """How well simulations follow logs: errors over open-loop windows, signals with their band, residuals.
 
 Windows start from the measured state (``likelihood.starts.estimates``), so a held-out log needs no fit of its own; a
-parameter that differs between logs takes the mean of the calibrated ones there. Of thrown bodies the first tenth of a
-second tells the start: a slope of noisy poses is so far off that its error would hide the model's.
+parameter that differs between logs takes the mean of the calibrated ones there.
 """
 
 from __future__ import annotations
@@ -68,17 +67,12 @@ def compare_errors(
     """Errors of theta (N,) against those of a reference, the nominal model if nothing else is named.
 
     The mean over logs and channels of log(RMSE of the reference / RMSE of theta), with the jackknife's standard error
-    over tenths of each log (a paired t-test on pieces of time). It speaks of these logs, not of others that the machine
-    might give; in a log of few windows the pieces of one share its start, and p is too small.
+    over tenths of each log (a paired t-test on pieces of time). In a log of few windows the pieces of one share its
+    start, and p is too small.
 
-    Where measured starts make nearly all of theta's error (velocities from noisy positions), both models are compared
-    from the starts that each fits best. None where there is nothing finite to compare.
-
-    Args:
-        windows: the logs.
-        theta: (N,).
-        reference: the same windows of another simulator, and its theta (M,).
-        fit_starts: whether both are compared from the starts that each fits best in any case.
+    Where measured starts make nearly all of theta's error (velocities from noisy positions), or with ``fit_starts``,
+    both models are compared from the starts that each fits best. ``reference`` is the same windows of another
+    simulator, and its theta (M,). None where there is nothing finite to compare.
     """
     models = (windows, theta), reference or (windows, np.clip(windows.simulator.space.default_theta, 0, 1))
     measured = [_squares(w, w.predict(x[None], measured_starts(w, x[None]))[0]) for w, x in models]
@@ -93,14 +87,11 @@ def compare_errors(
     for k in range(len(windows.trajectories)):
         mine = windows.log == k
         rows, owned = square[:, mine].reshape(2, -1, square.shape[-1]), windows.compared[mine].any(-1).ravel()
-        pieces = np.array_split(rows[:, owned], 10, axis=1)
-        sums = np.stack([piece.sum(1) for piece in pieces], axis=1)
+        sums = np.stack([piece.sum(1) for piece in np.array_split(rows[:, owned], 10, axis=1)], axis=1)
         usable = np.isfinite(sums).all((0, 1)) & (np.count_nonzero(sums, axis=1) > 1).all(0)
         if usable.any():
             parts.append(sums[:, :, usable])
-    if not parts:
-        return None
-    return replace(_jackknifed(parts), starts=share if by_starts else None)
+    return replace(_jackknifed(parts), starts=share if by_starts else None) if parts else None
 
 
 def _best_residuals(windows: BoundLikelihood, theta: FloatArray) -> FloatArray:
@@ -180,14 +171,11 @@ def signals(
 ) -> list[Signal]:
     """What the report draws of each log and channel: predicted (2, W, L, C) at the mode and by another, and bands."""
     every, out = np.concatenate([predicted, np.stack(band)]), []
-    for k, trajectory in enumerate(windows.trajectories):
-        lines = _stitched(windows, every, k)
-        begins = windows.start[windows.log == k] * trajectory.dt
+    for k, log in enumerate(windows.trajectories):
+        lines, begins = _stitched(windows, every, k), windows.start[windows.log == k] * log.dt
         for c, channel in enumerate(zip(windows.fitted, fitted_units(windows), strict=True)):
-            measured = trajectory.observations[:, windows.channels[c]]
-            mode, other, low, high = lines[..., c]
-            line = Signal(trajectory.name, use, *channel, trajectory.time, measured, mode, low, high, other, begins)
-            out.append(line)
+            measured, (mode, other, low, high) = log.observations[:, windows.channels[c]], lines[..., c]
+            out.append(Signal(log.name, use, *channel, log.time, measured, mode, low, high, other, begins))
     return out
 
 

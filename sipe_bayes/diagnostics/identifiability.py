@@ -48,7 +48,7 @@ def _dead(windows: BoundLikelihood, theta: FloatArray, name: str) -> list[tuple[
 def ridges(space: ParameterSpace, draws: FloatArray, contraction: Sequence[float]) -> list[Ridge]:
     """Combinations that are determined while their members are not.
 
-    By draws (n, N) of the posterior in units, and the contraction (N,), 1 - sd / prior sd, of each parameter.
+    By draws (n, N) of the posterior in units, and each parameter's contraction (N,), 1 - sd / prior sd.
     """
     spread = draws.std(0)
     moving = np.flatnonzero(spread > 1e-12 * np.maximum(np.abs(draws.mean(0)), 1e-300))
@@ -72,17 +72,13 @@ def ridges(space: ParameterSpace, draws: FloatArray, contraction: Sequence[float
 
 
 def _members(loadings: FloatArray) -> IntArray:
-    size = np.abs(loadings)
-    return np.flatnonzero(size > THRESHOLDS.ridge_member * size.max())
+    return np.flatnonzero(np.abs(loadings) > THRESHOLDS.ridge_member * np.abs(loadings).max())
 
 
 def _describe(
     space: ParameterSpace, draws: FloatArray, members: list[int], contraction: Sequence[float]
 ) -> Ridge | None:
-    """The best determined combination of the members.
-
-    None when it is not far better known than they, or each of them is well known by itself.
-    """
+    """The best determined combination of the members; None if not far better known, or each is well known by itself."""
     if len(members) < 2 or all(contraction[j] > THRESHOLDS.well_determined for j in members):
         return None
     chosen = draws[:, members]

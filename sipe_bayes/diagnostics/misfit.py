@@ -4,19 +4,15 @@ In the linear model of ``structure.augmented``, with parameters and initial stat
 noise, two kinds of statistics are looked at.
 
 - *Probes*: the score statistic of the size of each extension (C. R. Rao 1948,
-  https://doi.org/10.1017/S0305004100023987), all else projected out. A size that may not be negative counts as none
-  where it would be.
+  https://doi.org/10.1017/S0305004100023987), all else projected out; none where a size may not be negative and is.
 - *Whiteness* of each channel's whitened residuals: the sum of squared autocorrelations over lags 1, 2, 3, 5, 8, ...
   (G. Box, D. Pierce 1970, https://doi.org/10.1080/01621459.1970.10481180), and the largest mean square of ten pieces of
   time, beside that of all.
 
 The null is simulated: noise as estimated, drawn anew, projected alike. Each statistic's cube root is standardised by
 its mean and sd over these and the log's; the largest is compared with the largest of each. So the p-value holds for
-white and first-order autoregressive sensor noise, whatever the number of probes, up to the linearisation.
-
-A small p says that something is there, not that it is large: with it come the share of each channel's residual that the
-cause explains and, of a probe, how far the estimate would move if the model had it. Named are the extensions that the
-strongest effect of ``structure.single_effects`` may be.
+white and first-order autoregressive noise and any number of probes, up to the linearisation. Named are the extensions
+that the strongest effect of ``structure.single_effects`` may be.
 
 Deviations:
 
@@ -34,22 +30,18 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.diagnostics.records import Misfit
 from sipe_bayes.likelihood import FLAT_PRECISION
-from sipe_bayes.structure.augmented import AUGMENTED, AtNoise
+from sipe_bayes.structure.augmented import AtNoise
 from sipe_bayes.structure.discrepancy import Discrepancy
 from sipe_bayes.structure.probes import Probe
 
-_LAGS = (1, 2, 3, 5, 8, 13, 21, 34)  # of a channel's memory, at every scale, in samples
 _PIECES = 10  # of a log, among which the largest mean square is looked for
 
 
 def misfit(found: Discrepancy, sd: FloatArray | None = None, seed: int = 0, simulated: int = 199) -> Misfit:
     """How odd the residuals of fitted logs are, and what they look like most.
 
-    Args:
-        found: what the model lacks, or may lack, by the logs linearised at the estimate.
-        sd: (N,) of the posterior in theta; default that of the linearisation.
-        seed: of the null.
-        simulated: draws of the null, of which 199 resolve half a percent.
+    ``sd`` (N,) is that of the posterior in theta, by default of the linearisation; 199 draws of the null resolve half a
+    percent.
     """
     seen = found.at.logs.seen
     null = statistics(seen, drawn(seen, np.random.default_rng(seed), simulated))
@@ -61,8 +53,7 @@ def misfit(found: Discrepancy, sd: FloatArray | None = None, seed: int = 0, simu
     if effect is not None and effect.present > 0.5:
         sizes, first = np.zeros(len(probes)), {probes[k].name: probes[k] for k in reversed(found.usable)}
         sizes[found.usable] = effect.sizes / effect.present
-        causes = [first[name] for name in effect.alike([probes[k].name for k in found.usable])]
-        named = _of_sizes(found.at, sizes, causes, sd, p)
+        named = _of_sizes(found.at, sizes, [first[name] for name in effect.alike()], sd, p)
         if worst < len(probes) or not named.is_small:
             return replace(named, floor=floor)
     if worst < len(probes):
@@ -119,7 +110,7 @@ def _whiteness(at: AtNoise, left: FloatArray) -> FloatArray:
     itself. Of coloured noise the first autocorrelation is taken out, as an estimate of the noise would.
     """
     logs = at.logs
-    tells = at.noise.sd >= AUGMENTED.rounding * logs.windows.rounding
+    tells = ~logs.rests(at.noise.sd)
     memory, bursts = [], []
     for z, told in zip(logs.windows.whitened(left, at.noise), tells, strict=True):
         z = z * told
@@ -148,8 +139,8 @@ def oddness(seen: FloatArray, null: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def lags(z: FloatArray) -> list[int]:
-    """Those lags that z (n,) is long enough for."""
-    return [lag for lag in _LAGS if lag < len(z) // 4]
+    """Lags at every scale, in samples, that z (n,) is long enough for."""
+    return [lag for lag in (1, 2, 3, 5, 8, 13, 21, 34) if lag < len(z) // 4]
 
 
 def _of_sizes(at: AtNoise, sizes: FloatArray, causes: list[Probe], sd: FloatArray, p: float) -> Misfit:

@@ -30,10 +30,8 @@ STEPS = 2000  # control steps of windows spread evenly over long logs
 class OutsidePrior:
     """Where a log lies among simulations of the prior, and the channel and time, in s, where it is farthest.
 
-    Args:
-        p: of a log as far from the prior's simulations as this one.
-        followed: whether the calibrated model follows the log all the same, but for what it is named to lack.
-        floor: the least p that the simulations can give.
+    ``p`` is that of a log as far from them as this one, ``floor`` the least that they can give; ``followed``: whether
+    the calibrated model follows the log all the same, but for what it is named to lack.
     """
 
     p: float
@@ -66,12 +64,7 @@ def outside_prior(
     It is looked at in windows: commands of a controller, replayed over a whole log, drive every model but the true one
     away, and the log would be outside by staying.
 
-    Args:
-        windows: the logs, bound to the simulator.
-        prior: of the parameters.
-        noise: (O,) of all channels.
-        seed: of the simulations.
-        followed: whether the calibrated model follows the logs all the same.
+    ``noise`` (O,) is that of all channels, ``seed`` of the simulations; ``followed`` see ``OutsidePrior``.
 
     Raises:
         ValueError: where more than half of the simulations diverge.
@@ -86,9 +79,8 @@ def outside_prior(
     rotations = windows.simulator.environment.rotations
     made = [written_near(one.observations, logs.observations, rotations) for one in replayed if one is not None]
     if (count := len(made)) < SIMULATIONS // 2:
-        raise ValueError(
-            f"prior: {count} of {SIMULATIONS} simulations did not diverge, half are needed; narrow the bounds"
-        )
+        did = f"{count} of {SIMULATIONS} simulations did not diverge"
+        raise ValueError(f"prior: {did}, half are needed; narrow the bounds")
     far = np.zeros((len(logs), len(windows.channels), 1 + len(made)))
     farthest = np.zeros((len(logs), len(windows.channels)))
     for k, log in enumerate(logs):
@@ -112,9 +104,8 @@ def outside_prior(
             place, worst = np.unravel_index(far[mine, :, 0].argmax(), (len(mine), far.shape[1]))
             window = mine[place]
             p = float((1 + (largest >= far[window, worst, 0]).sum()) * floor)
-            channel = windows.simulator.environment.channels[windows.channels[worst]]
             when = float(windows.start[chosen[window]] * windows.dt[chosen[window]] + farthest[window, worst])
-            outcome.append(OutsidePrior(p, name, channel, when, followed, floor))
+            outcome.append(OutsidePrior(p, name, windows.fitted[worst], when, followed, floor))
     return outcome
 
 
@@ -122,8 +113,7 @@ def follows(windows: BoundLikelihood, predicted: FloatArray) -> bool:
     """Whether predictions (W, L, C) bend as the logs do, in every channel: with a wrong unit or sign they do not.
 
     What a straight line in time leaves of the median window is compared with what it leaves of the difference: a start
-    that is slightly off leaves such a line. A channel may rest in most windows, as what is only pushed now and then:
-    those in which it moves may speak for it, too.
+    that is slightly off leaves such a line. Where a channel rests in most windows, those in which it moves may speak.
     """
     for c in range(windows.observed.shape[2]):
         pairs = []

@@ -29,10 +29,7 @@ class ChannelScore:
 
 
 def improvement(scores: Iterable[ChannelScore]) -> float:
-    """How many times smaller the error became: geometric mean over logs and channels; NaN when none compares.
-
-    0 where simulations of the calibrated model diverge.
-    """
+    """How many times smaller the error became: geometric mean over logs and channels; NaN when none compares."""
     ratios = [s.rmse_default / s.rmse for s in scores if s.rmse > 0 and s.rmse_default > 0]
     ratios = [r for r in ratios if math.isfinite(r)]
     return float(scipy.stats.gmean(ratios)) if ratios else math.nan
@@ -42,7 +39,7 @@ def improvement(scores: Iterable[ChannelScore]) -> float:
 class BandCoverage:
     """The share of the samples of held-out logs that the 90 % bands hold, and its standard error by ``pieces``.
 
-    Pieces are tenths of each log and channel; ``half``: channel -> median half width of its band, and its unit.
+    ``half``: channel -> median half width of its band, and its unit.
     """
 
     share: float
@@ -55,13 +52,9 @@ class BandCoverage:
 class Comparison:
     """Whether the held-out errors are smaller than those of the model as given.
 
-    Args:
-        ratio: how many times, as the geometric mean over logs and channels.
-        low, high: ends of its 95 % interval.
-        p: of a ratio as far from 1 where the models predict alike; as the interval from a paired t-test.
-        pieces: of the logs, over which the test goes.
-        starts: share of the calibrated model's error that the measured starts of windows made, where that is nearly
-            all and each model's own best starts took their place.
+    ``ratio`` says how many times, as the geometric mean over logs and channels, with its 95 % interval and the ``p`` of
+    one as far from 1 where the models predict alike, by a paired t-test over pieces of the logs. ``starts`` is the
+    share of the calibrated model's error that measured starts made, where each model's best starts took their place.
     """
 
     ratio: float
@@ -84,15 +77,11 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Signal:
-    """One channel of one log for drawing; all arrays (T+1,), NaN where there is nothing.
+    """One channel of one log for drawing; all arrays (T+1,), NaN where there is nothing; time in s.
 
-    Args:
-        use: ``train`` or ``holdout``.
-        unit: of all but time, which is in s.
-        mode: prediction at the posterior mode.
-        low, high: ends of the 90 % band of what a sensor reads.
-        default: prediction of the nominal model.
-        window_starts: (W,) s, where every window of the log begins.
+    ``use`` is ``train`` or ``holdout``. Predictions are those of the posterior ``mode`` and of the nominal model
+    (``default``), ``low`` and ``high`` the ends of the 90 % band of what a sensor reads. ``window_starts`` (W,), in s,
+    is where every window of the log begins.
     """
 
     log: str
@@ -125,12 +114,9 @@ class Residual:
 
 @dataclass(frozen=True)
 class Ridge:
-    """A combination of parameters that the data determine while they leave its members open.
+    """A combination of parameters, a sum or product as a formula, that the data determine while they leave some open.
 
-    Args:
-        parameters: the members.
-        combination: a sum or product of them, as a formula, with its ``value``, its sd (``width``) and its ``unit``.
-        unknown: the members that are not determined alone.
+    ``value``, its sd (``width``) and its ``unit`` are the combination's; ``unknown`` are those not determined alone.
     """
 
     parameters: tuple[str, ...]
@@ -146,15 +132,7 @@ class Ridge:
         unit = f" {self.unit}" if self.unit not in ("", "1") else ""
         *others, last = self.unknown
         alone = f"{', '.join(others)} and {last} alone are" if others else f"{last} alone is"
-        return finding(
-            Code.RIDGE,
-            parameters=self.parameters,
-            combination=self.combination,
-            value=self.value,
-            width=self.width,
-            unit=unit,
-            alone=alone,
-        )
+        return finding(Code.RIDGE, **(vars(self) | {"unit": unit, "alone": alone}))
 
     @property
     def text(self) -> str:
@@ -164,19 +142,16 @@ class Ridge:
 
 @dataclass(frozen=True)
 class Misfit:
-    """What the residuals look like.
+    """What the residuals look like: the cause that fits them best, and what to do about it, in words.
 
     Args:
-        p: of residuals as odd as these under a right model with autoregressive noise.
-        cause: what fits them best, in words.
-        remedy: what to do about it.
+        p: of residuals as odd as these under a right model with autoregressive noise; at least ``floor``.
         log, channel: where it shows most, from ``start`` to ``stop``, in s.
         share: for each channel the share of the residual's variance that the cause explains. Where samples follow one
             another, of the whitened residual's that those before foretell; where noise is larger for a while, of its
             squares what that tenth of the time has too many.
         shift: for each parameter by how many posterior sds its estimate would move if the model had the cause; empty
             where that cannot be told.
-        floor: the least p that the draws of the null can give.
         alike: how many causes the cause's words name, which explain about as much.
     """
 
@@ -226,20 +201,14 @@ class Misfit:
         moved = ", ".join(f"{name} by {self.shift[name]:+.2g} sd" for name in self.moved)
         which = "it" if self.alike == 1 else "the first of them"
         move = f"with {which} in the model the estimate would move, {moved}"
-        return finding(
-            Code.MISFIT if self.matters else Code.SMALL_MISFIT,
-            parameters=self.moved if self.is_small else (),
-            log=self.log,
-            p=self.p_text,
-            cause=self.cause,
-            percent=float(f"{100 * self.share[self.channel]:.2g}"),
-            channel=self.channel,
-            start=self.start,
-            stop=self.stop,
-            effect=move if moved else "do not trust the intervals' width",
-            remedy=self.remedy,
-            far=THRESHOLDS.far_shift,
-        )
+        values = {
+            "parameters": self.moved if self.is_small else (),
+            "p": self.p_text,
+            "percent": float(f"{100 * self.share[self.channel]:.2g}"),
+            "effect": move if moved else "do not trust the intervals' width",
+            "far": THRESHOLDS.far_shift,
+        }
+        return finding(Code.MISFIT if self.matters else Code.SMALL_MISFIT, **(vars(self) | values))
 
 
 @dataclass(frozen=True)
@@ -257,17 +226,15 @@ class ChannelNoise:
 
 @dataclass(frozen=True)
 class LogReport:
-    """What a log held and what was done to it.
+    """What a log held and what was done to it; ``findings`` say it in words.
 
     Args:
         file: its path, and the ``sha256`` of what it holds.
         rate_hz: of the control grid, which has T+1 ``samples``.
         jitter_s: largest distance of a sample period from the median one, or, over dropped rows, from a multiple of it.
         gaps: (start, stop) in s from the trajectory's first sample, without a measurement for longer than ``max_gap``.
-        missing: masked samples of each channel.
-        wild: samples of each channel left out at reading or by the fit, since no smooth motion explains them.
+        missing, wild: samples of each channel that are masked, or left out since no smooth motion explains them.
         clipped: samples of each channel and command (``actuator:NAME``) in runs at its extreme value.
-        findings: the same in words, with what the user should know.
     """
 
     name: str

@@ -20,14 +20,10 @@ FLAGS = (Code.NO_EFFECT, Code.DEAD_RANGE, Code.NOT_DETERMINED, Code.MODE_AT_BOUN
 class ParameterSummary:
     """One parameter's marginal in its unit.
 
-    Args:
-        q05, q50, q95: quantiles of the posterior; q05 is the bound where the mode sits on a physical one.
-        mode: the best point's value.
-        contraction: 1 - sd / prior sd.
-        nuisance: whether it holds for one log alone.
-        further: (2,) ends of the discrepancy-aware 90 % interval; where logs differ or the model lacks something, that
-            of a further log. None where neither can be said.
-        known: whether the prior alone determines it well, and the logs do not say otherwise.
+    Quantiles are the posterior's; ``q05`` is the bound where the mode sits on a physical one. ``contraction`` is 1 - sd
+    / prior sd. A ``nuisance`` holds for one log alone. ``further`` (2,) are the ends of the discrepancy-aware 90 %
+    interval, where logs differ that of a further log; None where it cannot be said. ``known``: whether the prior alone
+    determines it well, and the logs do not say otherwise.
     """
 
     name: str
@@ -50,21 +46,17 @@ class ParameterSummary:
 class Calibration:
     """The outcome of ``sipe calibrate``.
 
-    ``findings`` is the one list of what the estimator, the checks and the readers noticed; ``warnings``, ``doubts`` and
-    ``flags`` are views of it.
-
     Args:
         train, holdout: errors on the training and on the held-out logs.
-        findings: what was noticed, in the order in which it is told.
+        findings: the one list of what the estimator, the checks and the readers noticed, in the order in which it is
+            told; ``warnings``, ``doubts`` and ``flags`` are views of it.
         ridges: combinations that are better known than their members.
-        bands: how much of the held-out logs their bands hold; None without any.
-        comparison: of the held-out errors with the nominal model; None without any.
+        bands, comparison: of the held-out logs and errors; None without any.
         misfit: what the residuals look like; None where they could not be looked at.
         outside: of each training log, whether the prior gives such a one.
         noise: of each fitted channel.
-        causes: for which the parameters' ``further`` allow, to first order.
-        further: theta with what the model lacks or may lack, of which the parameters' ``further`` are the intervals;
-            None where nothing can be said.
+        further: theta with what the model lacks or may lack, of which the parameters' ``further`` are the intervals,
+            to first order; None where nothing can be said. ``causes`` are what it allows for.
         mixing: of Markov chains, numbers by name: ``rhat``, ``ess``, ``acceptance``, ...; none of other methods.
         run: configuration, versions, seed and checksums, as JSON has them.
         checked: False as long as the checks of the fit have not been made.
@@ -130,21 +122,9 @@ class Calibration:
 
     def to_dict(self) -> dict[str, object]:
         """The object that ``--json`` prints and result.json holds."""
-        names = (
-            "train",
-            "holdout",
-            "comparison",
-            "bands",
-            "misfit",
-            "causes",
-            "ridges",
-            "findings",
-            "warnings",
-            "doubts",
-        )
-        more = ("noise", "logs", "rollouts", "out", "checked")
+        names = "train holdout comparison bands misfit causes ridges findings warnings doubts noise logs rollouts out"
         return {
-            **{name: records.plain(getattr(self, name)) for name in (*names, *more)},
+            **{name: records.plain(getattr(self, name)) for name in (*names.split(), "checked")},
             "parameters": [{**asdict(p), "flags": list(self.flags(p.name))} for p in self.parameters],
             "outside_prior": records.plain(self.outside),
             "mixing": dict(self.mixing) or None,

@@ -11,9 +11,8 @@ theta, theta' independent draws, | | Euclidean. Particles are the discrete distr
 Otherwise CRPS_j is that of the quantiles at 400 midpoints, and the energy score from draws, without bias (C. Ferro
 2014, "Fair scores for ensemble forecasts").
 
-Mind: the prior's mean is a perfect guess of a truth at the centre of the range, and out of distribution, where the
-truth lies outside the support, only CRPS, energy score, ``distance`` and ``noticed`` mean anything. A truth more than a
-whole range away is scored with a warning: it is most often physical values where theta is expected.
+Mind: the prior's mean is a perfect guess of a truth at the centre of the range, and where the truth lies outside the
+support only CRPS, energy score, ``distance`` and ``noticed`` mean anything.
 """
 
 from __future__ import annotations
@@ -44,15 +43,14 @@ class Scores:
 
     Args:
         accuracy: (N,) 1 - absolute error of the mean.
-        crps: (N,) continuous ranked probability score.
-        energy: the energy score.
+        crps, energy: (N,) continuous ranked probability score, and the energy score.
         nats: log p(truth) - log prior(truth); None without a density, minus infinity outside the support.
         covered: level -> (N,) whether the central interval holds the truth.
         contraction: (N,) 1 - sd / prior sd.
-        skill_over_prior_mean: 1 - CRPS / CRPS of the prior's mean, over parameters; None where that is exact.
-        skill_over_prior: the same of the prior.
-        distance: (N,) of a truth outside [0, 1] to the nearest bound, else 0.
-        noticed: (N,) of a truth outside, whether the posterior's median sits on that bound; None inside.
+        skill_over_prior_mean: 1 - CRPS / CRPS of the prior's mean, over parameters; None where that is exact. And
+            ``skill_over_prior``, the same of the prior.
+        distance: (N,) of a truth outside [0, 1] to the nearest bound, else 0; and whether the posterior's median sits
+            on that bound (``noticed``), None inside.
     """
 
     names: tuple[str, ...]
@@ -98,7 +96,7 @@ class Scores:
 def score(posterior: Posterior, truth: Numbers, prior: Posterior | None = None) -> Scores:
     """Scores of a posterior against the truth; the same posterior has the same scores.
 
-    Warns of a truth that is more than the range of a parameter away from its bounds.
+    Warns of a truth more than a whole range away: it is most often physical values where theta is expected.
 
     Args:
         posterior: of N parameters.

@@ -5,18 +5,11 @@ and marginalised, noise as given; what is left is the Fisher information I(theta
 With the present knowledge, a normal of precision P, the experiment leaves the covariance (P + I)^-1: D. Lindley 1956,
 "On a measure of the information provided by an experiment" (https://doi.org/10.1214/aoms/1177728069). The score of a
 candidate is the A-criterion (K. Chaloner, I. Verdinelli 1995, https://doi.org/10.1214/ss/1177009939) in sds: the
-contraction of each parameter's sd, averaged over draws of theta and over the parameters asked for. A parameter of one
-log (a zero error) learns nothing from another one.
+contraction of each parameter's sd, averaged over draws of theta and over the parameters asked for.
 
-Candidates are given, or generated within each actuator's limits:
-
-- chirps: the frequency goes from one end of the band to the other, up or down, by equal factors in equal times;
-- sums of at most ten sines of random phases, at multiples of 1 / duration.
-
-A candidate ends as it began, within a tenth of its duration, at zero or the middle of the limits. One that diverges at
-a draw counts there as telling nothing. Those that take a measured quantity further than logs went, by more than half of
-what that was in all, come after those that do not and tell half as much as the best at least: whether the machine may
-go there is not known here.
+A candidate that diverges at a draw counts there as telling nothing. Those that take a measured quantity further than
+logs went, by more than half of what that was in all, come after those that do not and tell half as much as the best at
+least: whether the machine may go there is not known here.
 """
 
 from __future__ import annotations
@@ -52,10 +45,8 @@ class Plan:
 class Suggestion:
     """A plan, the expected contraction of each parameter's sd, and the mean over those asked for (``score``).
 
-    Args:
-        reach: lowest and highest value of each channel over the draws.
-        diverged: at how many of the draws.
-        strays: the channels that go far beyond what logs reached.
+    ``reach`` is the lowest and highest value of each channel over the draws, of which so many ``diverged``; ``strays``
+    are the channels that go far beyond what logs reached.
     """
 
     plan: Plan
@@ -84,16 +75,10 @@ def rank(
 ) -> list[Suggestion]:
     """Plans, the most telling first of those that do not stray, then the others.
 
-    Args:
-        simulator: of the model.
-        likelihood: that the log would be fitted with.
-        plans: the candidates.
-        noise: (C,) of the fitted channels.
-        known: the prior, or the posterior so far.
-        names: of the parameters that count; default all that are not of one log.
-        reached: (C, 2) lowest and highest value of each channel in logs; default none, of which nothing strays.
-        draws: of ``known``, over which the gain is averaged.
-        seed: of the draws.
+    The log would be fitted with ``likelihood``; ``noise`` (C,) is that of the fitted channels. The gain is averaged
+    over ``draws`` of what is ``known``, the prior or the posterior so far. ``names`` of the parameters that count are
+    by default all that are not of one log. ``reached`` (C, 2), the lowest and highest value of each channel in logs, is
+    by default none, of which nothing strays.
 
     Raises:
         ValueError: for unknown names, and for those of one log.
@@ -180,13 +165,11 @@ def limits(simulator: Simulator, recorded: FloatArray | None = None) -> FloatArr
     """
     environment, model = simulator.environment, simulator.model
     ranges = np.full((environment.num_actions, 2), np.nan)
-    names = getattr(environment, "actuators", None)
-    for j in range(environment.num_actions):
-        actuator = model.actuator(names[j]).id if names is not None else None
-        if actuator is not None and model.actuator_ctrllimited[actuator]:
-            ranges[j] = model.actuator_ctrlrange[actuator]
-        elif recorded is not None:
-            ranges[j] = recorded[:, j].min(), recorded[:, j].max()
+    if recorded is not None:
+        ranges[:] = np.stack([recorded.min(0), recorded.max(0)], axis=1)
+    for j, name in enumerate(getattr(environment, "actuators", None) or ()):
+        if model.actuator_ctrllimited[model.actuator(name).id]:
+            ranges[j] = model.actuator_ctrlrange[model.actuator(name).id]
     if not (ranges[:, 0] < ranges[:, 1]).all():
         missing = "the model states no control range and in no log the command changes"
         raise ValueError(f"limits: {missing}; give the actuators ctrlrange")
@@ -198,26 +181,19 @@ def generate(
 ) -> list[Plan]:
     """So many plans of all kinds and sizes in turn.
 
-    Args:
-        count: how many.
-        duration: s.
-        dt: s that a command is held.
-        bounds: (A, 2) lowest and highest command.
-        band: lowest and highest frequency, Hz.
-        seed: of the phases.
+    Chirps go from one end of the ``band``, in Hz, to the other by equal factors in equal times; sums of at most ten
+    sines have random phases, at multiples of 1 / ``duration``. A plan ends as it began, within a tenth of its duration
+    in s, at zero or the middle of ``bounds`` (A, 2), the lowest and highest commands, each held for ``dt`` s.
 
     Raises:
         ValueError: for a band that the duration or dt cannot hold.
     """
     low, high = band
-    steps = round(duration / dt)
     if not 1 / duration <= low < high < 0.5 / dt:
-        raise ValueError(
-            f"band: expected {1 / duration:.3g} <= low < high < {0.5 / dt:.3g} Hz for {duration:g} s of {dt:g} s "
-            f"steps, got {low:g} and {high:g}"
-        )
+        expected = f"{1 / duration:.3g} <= low < high < {0.5 / dt:.3g} Hz for {duration:g} s of {dt:g} s steps"
+        raise ValueError(f"band: expected {expected}, got {low:g} and {high:g}")
     rng = np.random.default_rng(seed)
-    time = np.asarray(np.arange(steps) * dt, np.float64)
+    time = np.asarray(np.arange(round(duration / dt)) * dt, np.float64)
     edge = np.clip(np.minimum(time, time[-1] - time) / (0.05 * duration), 0.0, 1.0)
     plans = []
     for number in range(count):

@@ -8,11 +8,11 @@ would do to every sample (``structure.probes``), and what numbers with a toleran
 initial states are eliminated and theta is projected out, so that everything that is asked of the probes (which fit, how
 large they are, how far they move theta) is small linear algebra: S, the information of b, and q, its score.
 
-What a model lacks is a smooth force, and what it leaves of the samples, whitened by the noise of the fit, remembers
-itself: many such samples tell as much as one of its own would. With their integrated autocorrelation time as a factor
-on the variance of the noise scores at low frequencies have the variance that they show, as in the adjustment of a
-composite likelihood (R. Chandler, S. Bate, "Inference for clustered data using the independence loglikelihood",
-Biometrika 94 (2007), 167-183, https://doi.org/10.1093/biomet/asm015); a factor for each channel instead of a matrix.
+What a model lacks is a smooth force: what it leaves of the whitened samples remembers itself. With their integrated
+autocorrelation time as a factor on the variance of the noise scores at low frequencies have the variance that they
+show, as in the adjustment of a composite likelihood (R. Chandler, S. Bate, "Inference for clustered data using the
+independence loglikelihood", Biometrika 94 (2007), 167-183, https://doi.org/10.1093/biomet/asm015); a factor for each
+channel instead of a matrix.
 """
 
 from __future__ import annotations
@@ -27,55 +27,31 @@ import scipy.optimize
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.checkpoint import NOTHING_KEPT, Kept
-from sipe_bayes.core.options import Options, option
 from sipe_bayes.core.telling import Tell, silent
-from sipe_bayes.likelihood import (
-    FLAT_PRECISION,
-    BoundLikelihood,
-    Eliminated,
-    Linearisation,
-    Noise,
-    QuadraticPrior,
-)
+from sipe_bayes.likelihood import FLAT_PRECISION, BoundLikelihood, Eliminated, Linearisation, Noise, QuadraticPrior
 from sipe_bayes.simulation.callable_simulator import CallableSimulator
 from sipe_bayes.structure.extension import Placed
-from sipe_bayes.structure.probes import place_extensions, probes, probes_cost
-from sipe_bayes.structure.whitened_rows import WhitenedRows
+from sipe_bayes.structure.probes import bounds, effects, place_extensions, probes_cost
 
-_SHORT = 50  # samples, of which no memory is asked
 _FAINT = 1e-6  # of a probe's information, of its prior: what theta and the starts imitate to within that has no size
 _PRESSED = 1e-6  # of the range: a parameter that the search left on its bound
 
 
-@dataclass(frozen=True)
-class AugmentedOptions(Options):
-    """How much is simulated."""
-
-    simulated_steps: float = option(5e5, "physics steps of all probes together, about", above=0)
-    hides: float = option(1.4, "of the samples' scatter: from here on noise hides as much again", above=1)
-    rounding: float = option(2.0, "of the simulation's rounding, below which noise is that", least=1)
-    steps: int = option(4000, "of windows spread evenly over long logs: each probe is a simulation", "control steps")
-
-
-AUGMENTED = AugmentedOptions()
-
-
 def steps_of(windows: BoundLikelihood, placed: Sequence[Placed]) -> int:
-    """Control steps of the windows that are probed: so many that all probes together stay within their cost."""
+    """Control steps of the windows that are probed: so many that probes take about half a million physics steps."""
+    most = 4000
     if isinstance(windows.simulator, CallableSimulator):
-        return AUGMENTED.steps
+        return most
     each = max(probes_cost(windows, placed) / len(windows.trajectories), 1.0)
     skip = windows.simulator.physics_steps(float(windows.dt.min()))[0]
-    return int(min(AUGMENTED.steps, AUGMENTED.simulated_steps / (each * skip)))
+    return int(min(most, 5e5 / (each * skip)))
 
 
 @dataclass(frozen=True)
 class Projected:
-    """K probes with initial states and theta (N,) projected out.
+    """K probes with initial states and theta (N,) projected out: their information S (K, K) and score q (K,).
 
     Args:
-        information: S (K, K).
-        score: q (K,).
         whole: (K,) information of each with theta known: of one that theta can imitate far more than that in S.
         answer: (N, K): by how much theta moves back for one of each.
         covariance: (N, N) of theta; zero of parameters that the search left on their bounds.
@@ -92,14 +68,6 @@ class Projected:
     pressed: FloatArray
 
 
-@dataclass(frozen=True)
-class Fitted:
-    """Some probes at their best: log-likelihood in nats, and sizes (J,)."""
-
-    level: float
-    sizes: FloatArray
-
-
 class DivergesError(ValueError):
     """A simulation that diverges at the estimate."""
 
@@ -107,19 +75,17 @@ class DivergesError(ValueError):
 class AugmentedModel:
     """The logs linearised at the estimate, with K probes beside the N parameters.
 
-    Costs a linearisation and a rollout for each probe. Of long or many logs some windows are looked at, spread evenly.
-
-    ``share`` is how many times as many windows there are as are looked at.
+    Costs a linearisation and a rollout for each probe. Of long or many logs some windows are looked at, spread evenly;
+    ``share`` is how many times as many there are. ``probes`` and ``one_sided`` (K,), whether the size of each may not
+    be negative, are in the order of ``effects``; ``jacobian`` has columns of theta, probes and starts.
 
     Args:
         windows: the logs, W windows of C channels.
         theta: (N,) the estimate.
         noise: (C,) there.
-        starts: (W, D) of the windows; default the best.
-        prior: of the fit; default flat.
+        starts, prior: (W, D) of the windows, default the best; and of the fit, default flat.
         lin: at theta and starts, where it is known.
-        tell: called with what is being done.
-        kept: keeps what extensions do.
+        tell, kept: called with what is being done; keeps what extensions do.
         placed: extensions that are probed; default all that the registry has.
 
     Raises:
@@ -146,29 +112,26 @@ class AugmentedModel:
             windows, starts = windows.part(some), None if starts is None else starts[some]
             lin = None if lin is None else lin.part(some)
         starts = windows.fit_starts(theta, noise)[0] if starts is None else starts
-        prior = QuadraticPrior(theta, np.zeros((len(theta), len(theta)))) if prior is None else prior
+        n, prior = len(theta), prior or QuadraticPrior(theta, np.zeros((len(theta), len(theta))))
         self.windows, self.theta, self.noise, self.starts = windows, theta, noise, starts
-        linearisation = lin or windows.linearise(theta, starts)
-        if not linearisation.valid:
+        lin = lin or windows.linearise(theta, starts)
+        if not lin.valid:
             raise DivergesError("theta: the simulation diverges at the estimate; nothing can be said of its residuals")
         try:
-            made = probes(windows, theta, starts, placed, tell, kept)
+            self.effects = effects(windows, theta, starts, placed, tell, kept)
         finally:
             whole.rollouts = windows.rollouts
-        self.probes, self.one_sided, self.effects = made.named, made.one_sided, made.effects
-        n = windows.num_theta
-        parts = (linearisation.jacobian[..., :n], made.change, linearisation.jacobian[..., n:])
-        self.residual, self.jacobian = linearisation.residual, np.concatenate(parts, axis=-1)
+        self.probes = [probe for effect in self.effects for probe in effect.named()]
+        one_sided = [bounds(effect.placed.plain, effect.probes)[0] >= 0 for effect in self.effects]
+        self.one_sided = np.concatenate([np.zeros(0, bool), *one_sided])
+        changes = [effect.change / effect.size for effect in self.effects]
+        self.residual = lin.residual
+        self.jacobian = np.concatenate([lin.jacobian[..., :n], *changes, lin.jacobian[..., n:]], axis=-1)
         self.count, self.coloured = n + len(self.probes), bool((noise.tau > 0).any())
         self.inner, self.pull = prior.precision + FLAT_PRECISION * np.eye(n), prior.pull(theta)
+        self._trades = np.array([probe.trade or (0.0,) * n for probe in self.probes]).reshape(-1, n)
         self.rows = WhitenedRows(self.jacobian, windows)
         self.seen = AtNoise(self, noise)
-
-    def left(self, residual: FloatArray, step: FloatArray, starts: FloatArray) -> FloatArray:
-        """What a step of theta and probes (N + K,) and one of the starts (W, D) leave of a residual (W, L, C)."""
-        moved = self.jacobian[..., : self.count] @ step
-        turned = np.einsum("wlcd,wd->wlc", self.jacobian[..., self.count :], starts)
-        return np.where(self.windows.observed, residual - moved - turned, 0.0)
 
     def estimate_noise(self, before: Noise, sizes: FloatArray) -> Noise:
         """The noise where the probes have sizes (K,), theta and the starts being free to follow; ``before`` another."""
@@ -179,16 +142,22 @@ class AugmentedModel:
         noise = windows.estimate_noise(windows.moments(lin), before, pulls, self.coloured)
         return Noise(np.maximum(noise.sd, windows.rounding), noise.tau)
 
+    def rests(self, sd: FloatArray) -> BoolArray:
+        """Which channels (C,) have no more noise, of sd (C,), than the simulation's rounding, as of a joint at rest."""
+        return np.asarray(sd < 2.0 * self.windows.rounding)
+
     @property
     def scatter(self) -> Noise | None:
-        """White noise of the samples' scatter in channels whose fit takes far more for noise; None without such."""
+        """White noise of the samples' scatter in channels whose fit takes far more for noise; None without such.
+
+        From 1.4 times the scatter on noise hides as much again.
+        """
         noise, scatter = self.noise, self.windows.level.sd
-        rests = scatter < AUGMENTED.rounding * self.windows.rounding
-        holds = (scatter * AUGMENTED.hides < noise.sd) & ~rests
+        holds = (scatter * 1.4 < noise.sd) & ~self.rests(scatter)
         return Noise(np.where(holds, scatter, noise.sd), np.where(holds, 0.0, noise.tau)) if holds.any() else None
 
-    def fitted(self, columns: IntArray, before: Noise | None = None) -> Fitted:
-        """The log-likelihood with some probes (J,) of any size, at the noise that is best with them.
+    def fitted(self, columns: IntArray, before: Noise | None = None) -> tuple[float, FloatArray]:
+        """The log-likelihood in nats with some probes (J,) at their best sizes (J,), and these, at the best noise.
 
         before: from which that noise is searched; default the fit's.
         """
@@ -207,33 +176,24 @@ class AugmentedModel:
         total = arrow.gradient + pull
         step = np.linalg.solve(arrow.precision + precision, total)
         square = float(normal[:, -1, -1].sum()) - arrow.explained - float(total @ step)
-        return Fitted(-0.5 * (moments.log_determinant(noise) + square), np.asarray(step[n:], float))
+        return -0.5 * (moments.log_determinant(noise) + square), np.asarray(step[n:], float)
 
-    def fitted_at_noise(self, columns: IntArray) -> Fitted:
+    def fitted_at_noise(self, columns: IntArray) -> tuple[float, FloatArray]:
         """The same at the noise of the fit, beside the level without probes: a score test, without a simulation."""
         made = self.seen.projected
         information, score = made.information[np.ix_(columns, columns)], made.score[columns]
         sizes = np.linalg.solve(information + _FAINT * np.diag(made.whole[columns]), score)
-        return Fitted(0.5 * float(score @ sizes), np.asarray(sizes, float))
+        return 0.5 * float(score @ sizes), np.asarray(sizes, float)
 
     def traded(self, sizes: FloatArray) -> FloatArray:
         """By how much sizes (..., K) of the probes change theta itself (..., N), which they trade."""
         return np.sqrt(np.maximum(sizes, 0.0)) @ self._trades
 
-    @functools.cached_property
-    def _trades(self) -> FloatArray:
-        """(K, N) of each probe at size 1."""
-        nothing = (0.0,) * self.windows.num_theta
-        return np.array([probe.trade or nothing for probe in self.probes]).reshape(-1, len(nothing))
-
 
 class AtNoise:
-    """The normal equations of an ``AugmentedModel`` beside a noise, at sizes of its probes that are taken for likely.
+    """The normal equations of an ``AugmentedModel`` beside a noise (C,), at sizes (K,) of its probes, by default none.
 
-    Args:
-        logs: the model.
-        noise: (C,) of the channels.
-        sizes: (K,), by which parameters that the search left on a bound may come away from it; default none.
+    By the sizes parameters that the search left on a bound may come away from it.
     """
 
     def __init__(self, logs: AugmentedModel, noise: Noise, sizes: FloatArray | None = None) -> None:
@@ -255,13 +215,12 @@ class AtNoise:
         """(N,): which parameters are not held by a bound that the search left them on."""
         logs, n = self.logs, self.logs.windows.num_theta
         at_low, at_high = logs.theta <= _PRESSED, logs.theta >= 1 - _PRESSED
-        precision = self.arrow.precision[:n, :n] + logs.inner
-        pull = self.arrow.gradient[:n] + logs.pull - self.arrow.precision[:n, n:] @ self.sizes
         if not (at_low | at_high).any():
             return np.ones(n, bool)
-        root = np.linalg.cholesky(precision)
-        bounds = np.where(at_low, 0.0, -np.inf), np.where(at_high, 0.0, np.inf)
-        step = scipy.optimize.lsq_linear(root.T, np.linalg.solve(root, pull), bounds, tol=1e-12)
+        root = np.linalg.cholesky(self.arrow.precision[:n, :n] + logs.inner)
+        pull = self.arrow.gradient[:n] + logs.pull - self.arrow.precision[:n, n:] @ self.sizes
+        limits = np.where(at_low, 0.0, -np.inf), np.where(at_high, 0.0, np.inf)
+        step = scipy.optimize.lsq_linear(root.T, np.linalg.solve(root, pull), limits, tol=1e-12)
         return np.asarray(step.active_mask == 0)
 
     @functools.cached_property
@@ -282,8 +241,10 @@ class AtNoise:
 
     def left(self, sizes: FloatArray) -> FloatArray:
         """What is left of the residual (W, L, C) where the probes have sizes (K,) and all else follows."""
-        step = np.concatenate([self.projected.base - self.projected.answer @ sizes, sizes])
-        return self.logs.left(self.logs.residual, step, self.arrow.blocks(step))
+        logs, step = self.logs, np.concatenate([self.projected.base - self.projected.answer @ sizes, sizes])
+        moved = logs.jacobian[..., : logs.count] @ step
+        turned = np.einsum("wlcd,wd->wlc", logs.jacobian[..., logs.count :], self.arrow.blocks(step))
+        return np.where(logs.windows.observed, logs.residual - moved - turned, 0.0)
 
     @functools.cached_property
     def discounted(self) -> AtNoise:
@@ -294,7 +255,79 @@ class AtNoise:
 
 
 def _memory(z: FloatArray) -> float:
-    """Integrated autocorrelation time of z (n,), by emcee; at least one."""
-    if len(z) < _SHORT or not z.std():
+    """Integrated autocorrelation time of z (n,), by emcee; at least one, and of fewer than 50 samples one."""
+    if len(z) < 50 or not z.std():
         return 1.0
     return max(1.0, float(emcee.autocorr.integrated_time(z, tol=0)[0]))
+
+
+class WhitenedRows:
+    """Rows of a Jacobian (W, L, C, N + K + D), and the row before each, to be whitened by a noise.
+
+    The sums of ``Moments``, which serve any noise, grow with the square of the columns. Where there are many of these
+    and few noises, it is cheaper to whiten the rows for each, and to form only the products that are asked for.
+    """
+
+    def __init__(self, jacobian: FloatArray, windows: BoundLikelihood) -> None:
+        self.shape, self.num_theta = jacobian.shape[:3], jacobian.shape[-1] - windows.num_start
+        self.sequences = windows.sequences
+        self._crosses = self._placed([s.crosses.astype(float) for s in self.sequences]) > 0
+        self._rows, self._before = self._both(jacobian)
+
+    def normal(self, residual: FloatArray, noise: Noise) -> FloatArray:
+        """Products (W, K', K') of all columns with a residual (W, L, C), as ``Moments.normal`` gives them."""
+        rows = np.concatenate(self._whitened(residual[..., None], noise), axis=-1)
+        return np.swapaxes(rows, 1, 2) @ rows
+
+    def scores(self, residuals: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
+        """Products of the columns with residuals (W, L, C, S): (N + K, S), and of each window's start (W, D, S)."""
+        theta, starts, white = self._whitened(residuals, noise)
+        d = starts.shape[-1] // 2
+        each = np.swapaxes(starts, 1, 2) @ white
+        force = each[:, :d].copy()
+        force[:-1] += each[1:, d:]
+        return np.einsum("wrk,wrs->ks", theta, white, optimize=True), force
+
+    def _whitened(self, residuals: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Rows (W, C L, N + K), (W, C L, 2 D) of [x_w | x_{w-1}], and those of residuals (W, L, C, S) (W, C L, S).
+
+        Zero where nothing was observed.
+        """
+        n, weights, lags = self.num_theta, [], []
+        for s, sd, tau in zip(self.sequences, noise.sd.tolist(), noise.tau.tolist(), strict=True):
+            a = s.coefficients(tau)
+            weights.append(1 / (sd * np.sqrt(1 - a**2)))
+            lags.append(a * weights[-1])
+        weight, lag = self._placed(weights), self._placed(lags)
+        inside = np.where(self._crosses, 0.0, lag)
+        theta = weight * self._rows[..., :n] - lag * self._before[..., :n]
+        own = weight * self._rows[..., n:] - inside * self._before[..., n:]
+        # across an edge the row before belongs to the start of the window before
+        earlier = (inside - lag) * self._before[..., n:]
+        left, before = self._both(residuals)
+        return theta, np.concatenate([own, earlier], axis=-1), weight * left - lag * before
+
+    def _both(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Observed rows (W, C L, q) of values (W, L, C, q), and what is in the row before each."""
+        windows, length, channels, width = values.shape
+        flat = np.moveaxis(values, 2, 0).reshape(channels, windows * length, width)
+        rows, before = np.zeros((2, *flat.shape))
+        for c, s in enumerate(self.sequences):
+            linked = s.previous >= 0
+            rows[c, s.index] = flat[c, s.index]
+            before[c, s.index[linked]] = flat[c, s.previous[linked]]
+        return self._by_window(rows), self._by_window(before)
+
+    def _placed(self, values: list[FloatArray]) -> FloatArray:
+        """Numbers of each channel's samples at their rows (W, C L, 1), zero where nothing was observed."""
+        windows, length, channels = self.shape
+        out = np.zeros((channels, windows * length))
+        for row, s, own in zip(out, self.sequences, values, strict=True):
+            row[s.index] = own
+        return self._by_window(out)
+
+    def _by_window(self, rows: FloatArray) -> FloatArray:
+        """(W, C L, q) of (C, W L, q)."""
+        windows, length, channels = self.shape
+        turned = np.moveaxis(rows.reshape(channels, windows, length, -1), 0, 1)
+        return turned.reshape(windows, channels * length, -1)

@@ -1,7 +1,7 @@
 r"""How far theta may be off, for what the model lacks or may lack: the discrepancy-aware posterior.
 
 In the linear model of ``structure.augmented`` three things are unknown beside theta, each with a prior whose scale is
-integrated by its evidence, so that the interval widens as evidence grows and no alarm decides.
+integrated by its evidence.
 
 - *What is missing.* Sizes of extensions' probes are single effects, and all of them a little
   (``structure.single_effects``): what extensions would do spans the discrepancy between machine and model (M. Kennedy,
@@ -13,23 +13,21 @@ integrated by its evidence, so that the interval widens as evidence grows and no
   .. math:: p(Q \mid t) \propto (1 + t^2)^{-\nu / 2} e^{-Q / (2 (1 + t^2))},
 
   an integrated Birge ratio (R. Birge, "The calculation of errors by the method of least squares", Physical Review 40
-  (1932), https://doi.org/10.1103/PhysRev.40.207). Theta is that of a further log: a bias that all logs share is at
-  least as large as what differs between them.
+  (1932), https://doi.org/10.1103/PhysRev.40.207). Theta is that of a further log.
 
 Deviations:
 
 - The noise is estimated anew with the effects that are seen, in turns: what a model lacks made it larger and slower.
   Where the fit takes far more for noise than samples scatter by, turns begin at that scatter as well, and what ends at
   the higher likelihood counts: slow noise passes for slow forces.
-- Columns that theta imitates but for ``imitated`` of their information are not asked of the logs: at that level the
+- Columns that theta imitates but for a twentieth of their information are not asked of the logs: at that level the
   linearisation of dry friction is no better. With a tolerance they keep it, without one they are left out.
-- How much of what is moved to first order is moved in truth is normal around all of it, of sd ``reach``, and not
-  negative: a linearisation is right to about a half where effects are large.
+- How much of what is moved to first order is moved in truth is normal around all of it, of sd one half, and not
+  negative: a linearisation is right to about that where effects are large.
 - A number with a tolerance that the logs do not show moves theta only where something else is more likely missing than
-  not; elsewhere it is named (``contributions``), with what it would move: an interval that is ten times wider for the
-  gain of a motor that may be right is of no use.
+  not; elsewhere it is named (``contributions``), with what it would move.
 - A delay or lag that takes from a parameter what it adds moves theta by the root of its size (``structure.probes``);
-  where all are at work nothing is traded: the root of a small size is not small, and a delay would be wide on any log.
+  where all are at work nothing is traded: the root of a small size is not small.
 """
 
 from __future__ import annotations
@@ -43,46 +41,24 @@ import scipy.special
 import torch
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
-from sipe_bayes.core.options import Options, option
 from sipe_bayes.likelihood import UNIFORM_PRECISION, BoundLikelihood, Noise
 from sipe_bayes.posterior import GaussianMixture, Particles, Posterior
 from sipe_bayes.structure.augmented import AtNoise, AugmentedModel
-from sipe_bayes.structure.extensions.numerics import PhysicsStep
 from sipe_bayes.structure.probes import Probe
-from sipe_bayes.structure.single_effects import EFFECTS, Columns, Effects, find_effects
+from sipe_bayes.structure.single_effects import Columns, Effects, find_effects, size_grid
 from sipe_bayes.structure.tolerances import EXACT, Tolerances
 
-_PIECES = 5  # of a single log, where there is no other to compare it with
-_NOTHING = 1e-150  # information of a column that moves nothing: its square is no number
+DIFFER = 0.2  # prior probability that logs ask for different values
+_DRAWS = 4000  # of theta: quantiles to one or two percent of an sd
 _ENDS = (0.05, 0.95)  # of the intervals that are printed
-_SAME = 1e-3  # of a column's information: what is left of it beside a number with a tolerance that is the same
-
-
-@dataclass(frozen=True)
-class DiscrepancyOptions(Options):
-    """How the discrepancy is asked, and how many draws are made."""
-
-    imitated: float = option(0.05, "of a column's information, that theta leaves: not asked of the logs", least=0)
-    rounds: int = option(3, "in which effects and noise are estimated in turn", least=1)
-    differ: float = option(0.2, "prior probability that logs ask for different values", least=0)
-    reach: float = option(0.5, "sd of the share of what is moved to first order", least=0)
-    draws: int = option(4000, "of theta: quantiles to one or two percent of an sd", least=1)
-
-
-DISCREPANCY = DiscrepancyOptions()
 
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """What a model may lack, at its sizes to first order.
+    """What a model may lack, at its sizes to first order, by the linear model beside the noise that is left (``at``).
 
-    Args:
-        at: the linear model beside the noise that is left.
-        usable: (R,) numbers of the probes whose sizes the logs are asked for.
-        effects: of these; none where there are none.
-        known: the numbers with a tolerance.
-        spread: by how much logs differ.
-        tolerances: of ``known``.
+    The logs are asked for the sizes of the probes ``usable`` (R,), of which ``effects`` are; ``known`` are the numbers
+    with a tolerance, ``spread`` says by how much logs differ.
     """
 
     at: AtNoise
@@ -95,18 +71,17 @@ class Discrepancy:
     def draw(self, posterior: Posterior, seed: int) -> Particles:
         """Theta, from a posterior that takes the model for right, whose 90 % intervals lie within."""
         random, logs, made = np.random.default_rng(seed), self.at.logs, self.at.projected
-        count = DISCREPANCY.draws
-        single, every = np.zeros((2, count, len(logs.probes)))
+        single, every = np.zeros((2, _DRAWS, len(logs.probes)))
         if self.effects is not None:
-            single[:, self.usable] = sum(effect.draws(count, random) for effect in self.effects.single)
-            every[:, self.usable] = self.effects.every.draws(count, random)
+            single[:, self.usable] = sum(effect.draws(_DRAWS, random) for effect in self.effects.single)
+            every[:, self.usable] = self.effects.every.draws(_DRAWS, random)
         sizes = single + every
         known = self.known.draws(sizes, random)
         if not self.is_doubted:
-            steps = np.array([isinstance(probe.extension, PhysicsStep) for probe in logs.probes], bool)
-            known[:, ~asked(self.at) & ~steps] = 0.0
+            steps = np.array([probe.is_step for probe in logs.probes], bool)
+            known[:, ~_asked(self.at) & ~steps] = 0.0
         sizes += known
-        share = np.maximum(1 + DISCREPANCY.reach * random.standard_normal((count, 1)), 0.0)
+        share = np.maximum(1 + 0.5 * random.standard_normal((_DRAWS, 1)), 0.0)
         released = made.base - logs.seen.projected.base  # of parameters that come away from their bounds
         moved = released + share * (logs.traded(single) - sizes @ made.answer.T + made.pressed)
         return _holding(self._stretched(posterior, random) + moved, posterior)
@@ -117,12 +92,11 @@ class Discrepancy:
         both = (before > 0) & (after > 0)  # else a bound holds the parameter
         stretch = np.sqrt(np.where(both, after / np.where(both, before, 1.0), 1.0))
         generator = torch.Generator().manual_seed(int(random.integers(2**31)))
-        count, normal = (DISCREPANCY.draws,), isinstance(posterior, GaussianMixture)
-        wider = _before_the_cube(posterior, stretch) if isinstance(posterior, GaussianMixture) else posterior
-        theta = wider.sample(count, generator=generator).numpy()
-        if not normal:
+        if isinstance(posterior, GaussianMixture):
+            theta = _before_the_cube(posterior, stretch).sample((_DRAWS,), generator=generator).numpy()
+        else:
             middle = posterior.mean.numpy()
-            theta = middle + stretch * (theta - middle)
+            theta = middle + stretch * (posterior.sample((_DRAWS,), generator=generator).numpy() - middle)
         apart = self.spread.draws(len(theta), random) * np.sqrt(np.maximum(after, 0.0))
         return np.asarray(theta + apart * random.standard_normal(theta.shape))
 
@@ -137,7 +111,6 @@ class Discrepancy:
         sds, out = np.sqrt(np.diag(self.known.covariance)), []
         for k, sd in zip(self.known.columns.tolist(), sds.tolist(), strict=True):
             probe, share = probes[k], self.tolerances.of(probes[k])
-            assert probe.extension is not None
             left, off = sd / abs(share * probe.whole), probe.extension.off(probe.site, share)
             out.append(Contribution(probe, off, -answer[:, k] * math.copysign(sd, probe.whole), left))
         return out
@@ -145,22 +118,13 @@ class Discrepancy:
     @property
     def causes(self) -> tuple[str, ...]:
         """Extensions that are more likely at work than not, in words; those that no log tells apart as one."""
-        if self.effects is None:
-            return ()
-        seen = [effect for effect in self.effects.single if effect.present > 0.5]
-        asked_for = [self.at.logs.probes[k].name for k in self.usable]
-        return tuple(dict.fromkeys(" or ".join(effect.alike(asked_for)) for effect in seen))
+        seen = [] if self.effects is None else self.effects.seen
+        return tuple(dict.fromkeys(" or ".join(effect.alike()) for effect in seen))
 
 
 @dataclass(frozen=True)
 class LogEstimate:
-    """One log by itself.
-
-    Args:
-        name: of the log.
-        mean: (N,) in theta.
-        information: (N, N) in theta.
-    """
+    """One log by itself: mean (N,) and information (N, N) in theta."""
 
     name: str
     mean: FloatArray
@@ -173,19 +137,16 @@ def parts_of(windows: BoundLikelihood) -> list[tuple[str, IntArray]]:
     if len(logs) > 1:
         own = [(name, np.flatnonzero(windows.log == k)) for k, name in enumerate(logs.names)]
         return [(name, mine) for name, mine in own if len(mine)]
-    pieces = np.array_split(np.argsort(windows.start), min(_PIECES, windows.num_windows))
+    pieces = np.array_split(np.argsort(windows.start), min(5, windows.num_windows))
     return [(logs.names[0], piece) for piece in pieces]
 
 
 @dataclass(frozen=True)
 class Contribution:
-    """What a number with a tolerance adds.
+    """What a number with a tolerance adds, that a probe changes.
 
-    Args:
-        probe: that changes it.
-        sentence: what the model has wrong where it is off by its tolerance.
-        shift: (N,) of theta where it is an sd larger, by its tolerance and by what the logs tell of it.
-        left: that sd as a share of its tolerance: one where no motion tells it.
+    ``sentence`` is what the model has wrong where it is off by its tolerance. Theta has a ``shift`` (N,) where it is an
+    sd larger, by its tolerance and by what the logs tell of it; ``left`` is that sd as a share of its tolerance.
     """
 
     probe: Probe
@@ -202,7 +163,7 @@ def draw_differing(posterior: Posterior, logs: Sequence[LogEstimate], seed: int)
     """Theta of a further log, from a posterior and what several logs say by themselves, where nothing is probed."""
     middle, random = posterior.mean.numpy(), np.random.default_rng(seed)
     scores = [log.information @ (log.mean - middle) for log in logs]
-    apart = Spread.between([log.information for log in logs], scores).draws(DISCREPANCY.draws, random)
+    apart = Spread.between([log.information for log in logs], scores).draws(_DRAWS, random)
     generator = torch.Generator().manual_seed(int(random.integers(2**31)))
     theta = posterior.sample((len(apart),), generator=generator).numpy()
     theta = theta + apart * posterior.stddev.numpy() * random.standard_normal(theta.shape)
@@ -223,12 +184,7 @@ def _holding(theta: FloatArray, posterior: Posterior) -> Particles:
 
 
 def find_discrepancy(logs: AugmentedModel, tolerances: Tolerances = EXACT) -> Discrepancy:
-    """What the model lacks, or may lack; no simulation beside what ``logs`` took.
-
-    Args:
-        logs: the linear model at an estimate.
-        tolerances: of numbers that no machine has exactly.
-    """
+    """What the model lacks, or may lack, by its linear model at an estimate; nothing is simulated for it."""
     sds = np.array([tolerances.of(probe) * probe.whole for probe in logs.probes])
     sds = np.where(np.isfinite(sds), sds, 0.0)
     noises = [logs.noise, *([] if logs.scatter is None else [logs.scatter])]
@@ -239,7 +195,7 @@ def find_discrepancy(logs: AugmentedModel, tolerances: Tolerances = EXACT) -> Di
 def _explained(logs: AugmentedModel, noise: Noise, sds: FloatArray) -> tuple[AtNoise, IntArray, Effects | None]:
     """Effects and the noise that they leave, in turns from a noise on; the probes that were asked for."""
     at = logs.seen if noise is logs.noise else AtNoise(logs, noise)
-    for _ in range(DISCREPANCY.rounds):
+    for _ in range(3):
         before, told = at.sizes, at.discounted
         usable, effects = _effects(told, sds)
         sizes = np.zeros(len(logs.probes))
@@ -253,29 +209,27 @@ def _explained(logs: AugmentedModel, noise: Noise, sds: FloatArray) -> tuple[AtN
 
 def _level(at: AtNoise, usable: IntArray, effects: Effects | None) -> float:
     """The log-likelihood with effects that are more likely at work than not, less what is against each beforehand."""
-    seen = [] if effects is None else [effect for effect in effects.single if effect.present > 0.5]
+    seen = [] if effects is None else effects.seen
     columns = usable[[int(effect.by_column.argmax()) for effect in seen]]
-    against = sum(effect.against for effect in seen)
-    return at.logs.fitted(columns.astype(int), at.noise).level - against
+    return at.logs.fitted(columns.astype(int), at.noise)[0] - sum(effect.against for effect in seen)
 
 
-def asked(at: AtNoise) -> BoolArray:
+def _asked(at: AtNoise) -> BoolArray:
     """Whether the logs are asked for the size of each probe (K,): theta does not imitate almost all of it."""
     made = at.projected
-    return (made.whole > _NOTHING) & (np.diag(made.information) > DISCREPANCY.imitated * made.whole)
+    # the square of a column that moves nothing is no number
+    return (made.whole > 1e-150) & (np.diag(made.information) > 0.05 * made.whole)
 
 
 def _effects(at: AtNoise, sds: FloatArray) -> tuple[IntArray, Effects | None]:
     """The probes that may be missing, and what is told of them beside numbers of known sds (K,)."""
     probes, made = at.logs.probes, at.projected
-    able = [
-        not probe.by_log and not (isinstance(probe.extension, PhysicsStep) and sd)
-        for probe, sd in zip(probes, sds, strict=True)
-    ]
-    usable = np.flatnonzero(asked(at) & np.array(able, bool))
+    able = [not probe.by_log and not (probe.is_step and sd) for probe, sd in zip(probes, sds, strict=True)]
+    usable = np.flatnonzero(_asked(at) & np.array(able, bool))
     known = Known.of(at, sds)
     information, score = known.without(made.information, made.score)
-    usable = usable[np.diag(information)[usable] > _SAME * np.diag(made.information)[usable]]
+    # not those that are the same as a number with a tolerance
+    usable = usable[np.diag(information)[usable] > 1e-3 * np.diag(made.information)[usable]]
     if not len(usable):
         return usable, None
     names, one_sided = [probes[k].name for k in usable], at.logs.one_sided[usable]
@@ -286,11 +240,8 @@ def _effects(at: AtNoise, sds: FloatArray) -> tuple[IntArray, Effects | None]:
 class Known:
     """Numbers with a tolerance: their sizes are normal around zero, and told by the logs where theta leaves that.
 
-    Args:
-        columns: (J,) numbers of the probes.
-        cross: (J, K) information of theirs with all probes, zero where the logs are not asked.
-        covariance: (J, J) of their sizes.
-        mean: (J,) beside no other probe.
+    Of the probes ``columns`` (J,) the information ``cross`` (J, K) with all probes, zero where the logs are not asked,
+    the covariance (J, J) of the sizes and their mean (J,) beside no other probe.
     """
 
     columns: IntArray
@@ -302,7 +253,7 @@ class Known:
     def of(cls, at: AtNoise, sds: FloatArray) -> Known:
         """With sds (K,) in sizes, zero of what has no tolerance."""
         columns, made = np.flatnonzero(sds), at.projected
-        told = asked(at)[columns]
+        told = _asked(at)[columns]
         cross = np.where(told[:, None], made.information[columns], 0.0)
         own = np.where(np.outer(told, told), cross[:, columns], 0.0)
         covariance = np.linalg.inv(own + np.diag(1 / sds[columns] ** 2))
@@ -323,12 +274,9 @@ class Known:
 
 @dataclass(frozen=True)
 class Spread:
-    """By how much logs differ.
+    """By how much logs differ: how many times what a log leaves unknown by itself (T,), with probabilities (T,).
 
-    Args:
-        times: (T,) how many times what a log leaves unknown by itself.
-        weights: (T,) their probabilities.
-        alone: (N,) how many times its variance of all logs is that of a log by itself.
+    ``alone`` (N,) is how many times the variance of all logs that of a log by itself is.
     """
 
     times: FloatArray
@@ -358,9 +306,9 @@ class Spread:
         square = sum(float(s @ c @ s) for s, c in zip(scores, own, strict=True)) - float(pull @ whole @ pull)
         left = UNIFORM_PRECISION * (sum(np.trace(c) for c in own) - np.trace(whole))
         freedom = max((len(scores) - 1) * n - left, 0.0)
-        grid, believed = EFFECTS.grid
+        grid, believed = size_grid()
         times = np.append(0.0, grid)
-        prior = np.log(np.append(1 - DISCREPANCY.differ, DISCREPANCY.differ * believed))
+        prior = np.log(np.append(1 - DIFFER, DIFFER * believed))
         evidence = prior - 0.5 * freedom * np.log1p(times**2) - 0.5 * max(square, 0.0) / (1 + times**2)
         alone = np.mean([np.diag(c) for c in own], axis=0) / np.diag(whole)
         return cls(times, scipy.special.softmax(evidence), np.minimum(alone, 2 * len(scores)))

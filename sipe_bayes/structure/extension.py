@@ -1,9 +1,8 @@
 """What a model may get: an extension is a piece of physics with parameters of its own, placed at a joint or elsewhere.
 
 It reduces to the plain model where its parameters have the model's own values, their defaults. To add one
-that needs no more than parameters, write a row of ``structure.extensions.table``. Another one is a subclass of
-``Extension``, with a line in ``structure.registry``; one of your own, outside this package, is named by its import
-path. The simplest::
+to this package, write a row of ``structure.extensions.table``. One of your own, outside this package, is a subclass of
+``Extension`` that is named by its import path. The simplest::
 
     from sipe_bayes.core.parameters import Parameter
     from sipe_bayes.structure.extension import Extension
@@ -25,6 +24,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -46,10 +46,7 @@ _AND = " and\u00a0"  # between the names of a site that is several: no name of o
 
 
 class Extension(ABC):
-    """A piece of physics that a model may lack.
-
-    ``kind`` says what it is placed at. ``reference`` says where it is described.
-    """
+    """A piece of physics that a model may lack, placed at a site of its ``kind`` and described in ``reference``."""
 
     name: str
     kind: Kind
@@ -89,19 +86,17 @@ class Extension(ABC):
         return None
 
     def imitators(self, site: str) -> tuple[str, ...]:
-        """Targets, in its one parameter's unit, that do about the same, such as a delay beside a lag; none by default.
+        """Targets, in its one parameter's unit, that do about the same, such as a delay beside a lag.
 
-        Where one parameter of the model writes them, a probe takes from it what it adds: what is left to tell the two
-        apart grows with the square of that. Where one writes those of several sites, these are a site together.
+        Where one parameter of the model writes them, a probe takes from it what it adds. Where one writes those of
+        several sites, these are a site together.
         """
         return ()
 
     def probes(self, machine: Machine, parameters: tuple[Parameter, ...]) -> FloatArray:
-        """Theta (K, P) of its P parameters at which it is tried: directions away from the plain model, their defaults.
+        """Theta (K, P) of its P parameters at which it is tried: by default a small step of each away from its default.
 
         (G, K, P) where there are G shapes, of which one is to be chosen: several speeds, or numbers of poles.
-        By default a small step of each parameter by itself; where the others are to have other values meanwhile, as the
-        shape of a force whose size is tried, override this.
         """
         plain = plain_theta(parameters)
         return plain + np.diag(np.where(plain > 1 - 2 * PROBE, -PROBE, PROBE))
@@ -126,15 +121,10 @@ def plain_theta(parameters: Sequence[Parameter]) -> FloatArray:
 
 @dataclass(frozen=True)
 class Placed:
-    """An extension at a site.
+    """An extension at a site: the name of a joint, tendon, actuator, body or channel, or of several; or ``WORLD``.
 
-    Args:
-        extension: which.
-        site: name of the joint, tendon, actuator, body or channel, or of several that are moved alike; ``WORLD``.
-        parameters: its unknowns, with the model's own values as defaults.
-        edit: what it changes in the MJCF.
-        probes: theta (G, K, P) at which it is tried, for each of G shapes.
-        wholes: of each parameter, in its unit, what a tolerance is a share of; none of numbers that logs alone tell.
+    ``parameters`` have the model's own values as defaults. ``edit`` is what it changes in the MJCF, ``probes`` theta
+    (G, K, P) at which it is tried, for each of G shapes; ``wholes`` see ``Extension.wholes``.
     """
 
     extension: Extension
@@ -167,11 +157,9 @@ def extended(environment: MjcfEnvironment, placed: Sequence[Placed]) -> MjcfEnvi
         TargetError: where two write the same number.
         ModelError: where an edit breaks the model.
     """
-    edits = [*environment.edits, *(p.edit for p in placed if p.edit is not None)]
-    parameters = [*environment.parameters, *(q for p in placed for q in p.parameters)]
-    return MjcfEnvironment.build(
-        environment.source, parameters, environment.actuators, environment.measurements, edits, environment.added
-    )
+    own, edits = environment, [*environment.edits, *(p.edit for p in placed if p.edit is not None)]
+    parameters = [*own.parameters, *(q for p in placed for q in p.parameters)]
+    return MjcfEnvironment.build(own.source, parameters, own.actuators, own.measurements, edits, own.added)
 
 
 def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
@@ -186,26 +174,22 @@ def placements(extension: Extension, machine: Machine) -> Iterator[Placed]:
     }
     taken, count = machine.written(), len(machine.environment.parameters)
     for site in (*sites[extension.kind], *_together(extension, sites[extension.kind], machine)):
-        try:
+        with _user_code(extension, site):
             parameters = tuple(_with_own(machine, p) for p in extension.parameters(machine, site))
             edit = extension.edit(machine, site)
             if not (parameters or (extension.fixed and edit)) or any(t in taken for p in parameters for t in p.targets):
                 continue
             draft = Placed(extension, site, parameters, edit, np.zeros((0, 0, len(parameters))))
             _ = draft.sentence
-        except Exception as error:  # the user's own code may raise anything
-            raise _failed(extension, site, error) from error
         try:
             space = extended(machine.environment, [draft]).space
         except ValueError:
             continue  # the model has no place for it, or a value of its own beyond these bounds
         own = tuple(space)[count:]
-        try:
-            probes = _shapes(np.asarray(extension.probes(machine, own), float))
+        with _user_code(extension, site):
+            probes = np.asarray(extension.probes(machine, own), float)
             wholes = extension.wholes(machine, site)
-        except Exception as error:
-            raise _failed(extension, site, error) from error
-        yield Placed(extension, site, own, draft.edit, probes, wholes)
+        yield Placed(extension, site, own, edit, probes if probes.ndim == 3 else probes[None], wholes)
 
 
 def _together(extension: Extension, sites: tuple[str, ...], machine: Machine) -> Iterator[str]:
@@ -232,11 +216,11 @@ def _with_own(machine: Machine, parameter: Parameter) -> Parameter:
     return replace(parameter, low=low, high=high)
 
 
-def _shapes(probes: FloatArray) -> FloatArray:
-    """Probes (G, K, P), of one shape where they are (K, P)."""
-    return probes if probes.ndim == 3 else probes[None]
-
-
-def _failed(extension: Extension, site: str, error: Exception) -> ValueError:
-    reason = " ".join(f"{type(error).__name__}: {error}".split())
-    return ValueError(f"structure: extension {extension.name!r} fails at {site!r} ({reason}); correct it")
+@contextmanager
+def _user_code(extension: Extension, site: str) -> Iterator[None]:
+    """Whatever an extension raises as one line."""
+    try:
+        yield
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ValueError(f"structure: extension {extension.name!r} fails at {site!r} ({reason}); correct it") from error

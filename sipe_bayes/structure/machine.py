@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import mujoco
@@ -15,86 +17,66 @@ from sipe_bayes.envs.laws.base import SINGLE
 from sipe_bayes.envs.laws.bound import driven_joint
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood import BoundLikelihood
-from sipe_bayes.simulation.simulator import Simulator
-
-_SAMPLES = 400  # of the logs, of which forces are computed
-_PARALLEL = 1e-6  # of the cosine between two axes
 
 
 @dataclass(frozen=True)
-class JointSizes:
-    """Root-mean-squares along the logs of one joint, in SI.
+class Sizes:
+    """The sizes of a motion at a site, in SI (rad and N m of a hinge); nan of what it does not have.
 
     Args:
-        position: rad or m.
-        velocity: rad/s or m/s.
-        force: N m or N, the largest of what drives, carries and accelerates it.
-        inertia: kg m^2 or kg, that it moves.
+        position: root-mean-square of a joint's, spread of a tendon's length or of what a channel measures.
+        velocity: root-mean-square, of an actuator that of the joint that it drives.
+        force: the largest of what drives, carries and accelerates a joint; what that of its joints amounts to along a
+            tendon; root-mean-square of an actuator's, of several the largest.
+        inertia: that a joint moves.
+        command: the largest.
+        length, least: a tendon's mean, and the smallest that it may have: -inf of sums of joints' positions.
+        dt, step: shortest time between samples, and that of the physics.
     """
 
-    position: float
-    velocity: float
-    force: float
-    inertia: float
+    position: float = math.nan
+    velocity: float = math.nan
+    force: float = math.nan
+    inertia: float = math.nan
+    command: float = math.nan
+    length: float = math.nan
+    least: float = math.nan
+    dt: float = math.nan
+    step: float = math.nan
 
-
-@dataclass(frozen=True)
-class TendonSizes:
-    """Along the logs of one tendon that moves, in m and N (in rad and N m where it is made up of hinges' angles).
-
-    Args:
-        length: its mean.
-        stretch: the standard deviation of its length.
-        velocity: root-mean-square.
-        force: that the forces of the joints that it moves amount to along it.
-        least: the smallest length that it may have; -inf of sums of joints' positions.
-    """
-
-    length: float
-    stretch: float
-    velocity: float
-    force: float
-    least: float
+    def shortest(self, share: float, most: float) -> float:
+        """A distance over which the usual force may be built up: a share of the usual one, at least what a step can."""
+        return min(max(share * self.position, self.force * self.step**2 / self.inertia), most / 2)
 
 
 @dataclass(frozen=True)
 class BodySizes:
-    """Of one body that moves, as the model has it, in SI.
+    """Of one body that moves, as the model has it, in kg and m: x, y and z of its centre of mass in the body's frame.
 
-    Args:
-        mass: kg.
-        centre: x, y and z of the centre of mass in the body's frame, in m.
-        gyration: radius of gyration about it, in m.
-        reach: radius of gyration about the nearest joint that turns it, in m; ``gyration`` where none does.
-        turned: the axes of the body's frame along which it matters where the centre lies: all but those that every
-            joint turns it about.
+    With the radii of ``gyration`` about that and about the nearest joint that turns it (``reach``; ``gyration`` where
+    none does), and the axes of the frame along which it matters where the centre lies: all but those that every joint
+    turns it about.
     """
 
     mass: float
-    centre: tuple[float, float, float]
+    centre: tuple[float, ...]
     gyration: float
     reach: float
-    turned: tuple[bool, bool, bool]
+    turned: tuple[bool, ...]
 
 
 @dataclass(frozen=True)
 class Machine:
-    """An environment with the sizes of its motion along the logs.
+    """An environment, the user's model, with the sizes of its motion along the logs, by name.
 
-    Args:
-        environment: the user's model.
-        joints: of each hinge and slide joint.
-        tendons: of each that joints move.
-        forces: root-mean-square of each commanded actuator's force.
-        commands: largest size of each command.
-        channels: spread of each measured channel.
-        logs: names of the logs.
-        dt: shortest time between samples, in seconds.
+    Of each hinge and slide joint, each tendon that joints move, the root-mean-square of each commanded actuator's
+    force, the largest size of each command, and the spread of each measured channel; ``dt`` is the shortest time
+    between samples, in seconds.
     """
 
     environment: MjcfEnvironment
-    joints: dict[str, JointSizes]
-    tendons: dict[str, TendonSizes]
+    joints: dict[str, Sizes]
+    tendons: dict[str, Sizes]
     forces: dict[str, float]
     commands: dict[str, float]
     channels: dict[str, float]
@@ -118,12 +100,11 @@ class Machine:
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         for index in range(1, model.nbody):
-            mass, name = float(model.body_mass[index]), str(model.body(index).name)
+            mass, name, centre = float(model.body_mass[index]), str(model.body(index).name), model.body_ipos[index]
             if name and mass > 0 and model.body_weldid[index]:
-                x, y, z = (float(place) for place in model.body_ipos[index])
                 gyration = float(np.sqrt(model.body_inertia[index].max() / mass))
                 reach = float(np.hypot(gyration, _lever(model, data, index)))
-                sizes[name] = BodySizes(mass, (x, y, z), gyration, reach, _turned(model, data, index))
+                sizes[name] = BodySizes(mass, tuple(centre.tolist()), gyration, reach, _turned(model, data, index))
         return sizes
 
     @cached_property
@@ -161,101 +142,80 @@ class Machine:
         """Targets that the user's parameters write."""
         return frozenset(t for p in self.environment.parameters for t in p.targets)
 
-    def has_added(self, body: str) -> bool:
-        """Whether the user says of a log by how much a body is heavier in it."""
-        return any(one.target == f"body:{body}.mass" for one in self.environment.added)
-
 
 def machine_of(windows: BoundLikelihood, theta: FloatArray, starts: FloatArray) -> Machine:
-    """The machine as it moves at an estimate.
-
-    Args:
-        windows: the logs, of an ``MjcfEnvironment``.
-        theta: (N,).
-        starts: (W, D).
+    """The machine as it moves along the logs at an estimate theta (N,), from starts (W, D).
 
     Raises:
-        ValueError: for another environment.
+        ValueError: for an environment that is no ``MjcfEnvironment``.
     """
-    simulator = windows.simulator
-    environment = simulator.environment
+    environment = windows.simulator.environment
     if not isinstance(environment, MjcfEnvironment):
         raise ValueError("simulator: structures are looked for in a user's MJCF; give a Simulator of one")
-    model = simulator.written(theta)
-    states, controls = _motion(simulator, windows, theta, starts)
-    driving, own = _forces(model, states, controls)
-    labels = {a: model.actuator(a).id for a in environment.actuators}
+    model = windows.simulator.written(theta)
+    states, controls = _motion(windows, theta, starts)
+    driving, pulls, inertias = _forces(model, states, controls)
     commands = {a: float(np.abs(windows.actions[..., k]).max()) for k, a in enumerate(environment.actuators)}
     joints = {}
     for joint in range(model.njnt):
         if int(model.jnt_type[joint]) in SINGLE and model.joint(joint).name:
             dof, address = int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
-            inertia = float(own.inertia[dof])
-            sizes = (_rms(states[:, 1 + address]), _rms(states[:, 1 + model.nq + dof]), own.size[dof], inertia)
-            joints[str(model.joint(joint).name)] = JointSizes(*(max(float(s), 1e-9) for s in sizes))
-    forces = {a: max(_rms(driving[:, index]), 1e-9) for a, index in labels.items()}
-    spread = np.nanstd(windows.trajectories.observations, axis=(0, 1))
-    channels = dict(zip(environment.channels, np.maximum(spread, 1e-9).tolist(), strict=True))
-    names = tuple(str(name) for name in windows.trajectories.names)
-    tendons = _tendons(model, states, own.size)
+            sizes = _rms(states[:, 1 + address]), _rms(states[:, 1 + model.nq + dof]), pulls[dof], inertias[dof]
+            joints[str(model.joint(joint).name)] = Sizes(*(max(float(s), 1e-9) for s in sizes))
+    forces = {a: max(_rms(driving[:, model.actuator(a).id]), 1e-9) for a in environment.actuators}
+    spread = np.maximum(np.nanstd(windows.trajectories.observations, axis=(0, 1)), 1e-9)
+    channels = dict(zip(environment.channels, spread.tolist(), strict=True))
+    names, tendons = tuple(str(name) for name in windows.trajectories.names), _tendons(model, states, pulls)
     return Machine(environment, joints, tendons, forces, commands, channels, names, float(windows.dt.min()))
 
 
-def _turned(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> tuple[bool, bool, bool]:
+def _joints_of(model: mujoco.MjModel, body: int) -> Iterator[tuple[int, int]]:
+    """The joints that move a body and their types, the nearest first."""
+    while body:
+        first = int(model.body_jntadr[body])
+        yield from ((k, int(model.jnt_type[k])) for k in reversed(range(first, first + int(model.body_jntnum[body]))))
+        body = int(model.body_parentid[body])
+
+
+def _turned(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> tuple[bool, ...]:
     """Along which axes of a body's frame a place in it is moved by the joints that turn it."""
     axes, turned = data.xmat[body].reshape(3, 3), np.zeros(3, bool)
-    while body:
-        for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
-            kind = int(model.jnt_type[joint])
-            if kind == mujoco.mjtJoint.mjJNT_HINGE:
-                turned |= np.abs(axes.T @ data.xaxis[joint]) < 1 - _PARALLEL
-            elif kind != mujoco.mjtJoint.mjJNT_SLIDE:
-                turned[:] = True
-        body = int(model.body_parentid[body])
-    x, y, z = turned.tolist()
-    return x, y, z
+    for joint, kind in _joints_of(model, body):
+        if kind == mujoco.mjtJoint.mjJNT_HINGE:
+            turned |= np.abs(axes.T @ data.xaxis[joint]) < 1 - 1e-6
+        elif kind != mujoco.mjtJoint.mjJNT_SLIDE:
+            turned[:] = True
+    return tuple(turned.tolist())
 
 
 def _lever(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> float:
     """How far a body's centre of mass lies from the nearest joint that turns it; 0 where none does."""
-    centre = data.xipos[body]
-    while body:
-        first = int(model.body_jntadr[body])
-        for joint in reversed(range(first, first + int(model.body_jntnum[body]))):
-            kind, apart = int(model.jnt_type[joint]), centre - data.xanchor[joint]
-            if kind == mujoco.mjtJoint.mjJNT_HINGE:
-                return float(np.linalg.norm(np.cross(data.xaxis[joint], apart)))
-            if kind == mujoco.mjtJoint.mjJNT_BALL:
-                return float(np.linalg.norm(apart))
-        body = int(model.body_parentid[body])
+    for joint, kind in _joints_of(model, body):
+        apart = data.xipos[body] - data.xanchor[joint]
+        if kind == mujoco.mjtJoint.mjJNT_HINGE:
+            return float(np.linalg.norm(np.cross(data.xaxis[joint], apart)))
+        if kind == mujoco.mjtJoint.mjJNT_BALL:
+            return float(np.linalg.norm(apart))
     return 0.0
 
 
-@dataclass(frozen=True)
-class _Own:
-    """Of each dof: the size of its forces (nv,) and its inertia (nv,)."""
-
-    size: FloatArray
-    inertia: FloatArray
-
-
-def _motion(
-    simulator: Simulator, windows: BoundLikelihood, theta: FloatArray, starts: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _motion(windows: BoundLikelihood, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, FloatArray]:
     """States (n, S) and controls (n, U) spread over the windows."""
-    begin = windows.states(theta[None], starts[None])[0]
+    simulator, begin = windows.simulator, windows.states(theta[None], starts[None])[0]
     run = simulator.rollout(theta[None], windows.actions, begin, windows.dt, windows.names)
     assert run.states is not None
     states = run.states[:, :-1].reshape(-1, run.states.shape[-1])
     controls = simulator.environment.control(simulator.model, states, windows.actions.reshape(len(states), -1))
     inside = (np.arange(windows.actions.shape[1]) < windows.steps[:, None]).ravel() & np.isfinite(states).all(1)
     rows = np.flatnonzero(inside)
-    rows = rows[np.linspace(0, len(rows) - 1, min(_SAMPLES, len(rows))).astype(int)]
+    rows = rows[np.linspace(0, len(rows) - 1, min(400, len(rows))).astype(int)]
     return states[rows], controls[rows]
 
 
-def _forces(model: mujoco.MjModel, states: FloatArray, controls: FloatArray) -> tuple[FloatArray, _Own]:
-    """Actuator forces (n, nu) along a motion, and the dofs' sizes."""
+def _forces(
+    model: mujoco.MjModel, states: FloatArray, controls: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Actuator forces (n, nu) along a motion; of the dofs the size of their forces (nv,) and their inertia (nv,)."""
     data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
     driving, parts, diagonals = [], [], []
     for state, control in zip(states, controls, strict=True):
@@ -266,10 +226,10 @@ def _forces(model: mujoco.MjModel, states: FloatArray, controls: FloatArray) -> 
         driving.append(data.actuator_force.copy())
         diagonals.append(np.diag(inertia).copy())
         parts.append(np.abs([data.qfrc_actuator, data.qfrc_bias, inertia @ data.qacc]).max(0))
-    return np.array(driving), _Own(np.sqrt((np.array(parts) ** 2).mean(0)), np.mean(diagonals, axis=0))
+    return np.array(driving), np.sqrt((np.array(parts) ** 2).mean(0)), np.mean(diagonals, axis=0)
 
 
-def _tendons(model: mujoco.MjModel, states: FloatArray, forces: FloatArray) -> dict[str, TendonSizes]:
+def _tendons(model: mujoco.MjModel, states: FloatArray, forces: FloatArray) -> dict[str, Sizes]:
     """Of the tendons that move, from states (n, S) and sizes of the dofs' forces (nv,)."""
     data, rows = mujoco.MjData(model), []
     for state in states if model.ntendon else ():
@@ -282,12 +242,10 @@ def _tendons(model: mujoco.MjModel, states: FloatArray, forces: FloatArray) -> d
     for tendon in set(range(model.ntendon)) - gears:  # the motor's side of a joint is that joint's
         length, velocity, pull, square = (np.array([row[k][tendon] for row in rows]) for k in range(4))
         if model.tendon(tendon).name and length.std() > 0 and square.mean() > 0:
-            force = float(pull.mean() / square.mean())
             by_joints = int(model.wrap_type[model.tendon_adr[tendon]]) == int(mujoco.mjtWrap.mjWRAP_JOINT)
-            least = -np.inf if by_joints else 0.0
-            sizes[str(model.tendon(tendon).name)] = TendonSizes(
-                float(length.mean()), float(length.std()), max(_rms(velocity), 1e-9), max(force, 1e-9), least
-            )
+            least, force = -np.inf if by_joints else 0.0, max(float(pull.mean() / square.mean()), 1e-9)
+            moving = Sizes(float(length.std()), max(_rms(velocity), 1e-9), force)
+            sizes[str(model.tendon(tendon).name)] = replace(moving, length=float(length.mean()), least=least)
     return sizes
 
 

@@ -17,30 +17,8 @@ from sipe_bayes.core.validation import nearest_name
 from sipe_bayes.structure.extension import KINDS, Extension
 from sipe_bayes.structure.extensions.table import ROWS
 
-_PACKAGE = "sipe_bayes.structure.extensions"
-_CLASSES = {  # name: module and class
-    "gear_compliance": "elastic:GearCompliance",
-    "link_compliance": "elastic:LinkCompliance",
-    "gear_backlash": "elastic:GearBacklash",
-    "link_backlash": "elastic:LinkBacklash",
-    "lag": "actuator:Lag",
-    "cogging": "actuator:Cogging",
-    "gain": "actuator:Gain",
-    "log_gain": "actuator:LogGain",
-    "mass": "body:Mass",
-    "log_mass": "body:LogMass",
-    "centre_of_mass": "body:CentreOfMass",
-    "sensor_delay": "world:SensorDelay",
-    "sensor_filter": "world:SensorFilter",
-    "gravity_tilt": "world:GravityTilt",
-    "base_compliance": "elastic:BaseCompliance",
-    "supply_sag": "world:SupplySag",
-    "physics_step": "numerics:PhysicsStep",
-    "hard_friction": "numerics:HardFriction",
-    "residual": "world:Residual",
-}
-EXTENSIONS = (*ROWS, *_CLASSES)
-"""Names, those of the table first."""
+EXTENSIONS = tuple(ROWS)
+"""Names."""
 
 
 def get_extension(name: str) -> Extension:
@@ -51,9 +29,6 @@ def get_extension(name: str) -> Extension:
     """
     if name in ROWS:
         return ROWS[name]
-    if name in _CLASSES:
-        module, _, kind = _CLASSES[name].partition(":")
-        return _made(f"{_PACKAGE}.{module}", kind, name)
     module, _, kind = name.rpartition(":")
     if not module:
         hint = nearest_name(name, EXTENSIONS) or f"; known are {', '.join(EXTENSIONS)}"

@@ -1,11 +1,9 @@
 r"""Which few of many columns are at work, and how surely: a sum of single effects, and all of them, each a little.
 
-The coefficients of K correlated columns, of which nobody knows which are at work, are a sum of effects, each of one
-column at most (SuSiE: G. Wang, A. Sarkar, P. Carbonetto, M. Stephens, "A simple new approach to variable selection in
-regression", Journal of the Royal Statistical Society B 82 (2020), 1273-1300, https://doi.org/10.1111/rssb.12388). An
-effect's posterior says with what probability it is which column, so that columns that no log can tell apart stand
-together with about the same probability, and none is chosen. Beside them all columns may be at work, each a little, for
-what none of them is (SuSiE-inf: R. Cui et al., "Improving fine-mapping by modeling infinitesimal effects", Nature
+The coefficients of K correlated columns are a sum of effects, each of one column at most (SuSiE: G. Wang, A. Sarkar,
+P. Carbonetto, M. Stephens, "A simple new approach to variable selection in regression", J. R. Stat. Soc. B 82 (2020),
+1273-1300, https://doi.org/10.1111/rssb.12388), each with the probability that it is which. Beside them all may be at
+work, each a little (SuSiE-inf: R. Cui et al., "Improving fine-mapping by modeling infinitesimal effects", Nature
 Genetics 56 (2024), 162-169, https://doi.org/10.1038/s41588-023-01597-3).
 
 With S the information of the columns and q their score, an effect of column k has b_k ~ N(0, t^2 / S_kk), halved where
@@ -23,8 +21,7 @@ distributions for variance parameters in hierarchical models", 2006, https://doi
 Deviations:
 
 - The size of an effect is integrated over a grid, not estimated, and each effect may be none.
-- Effects are added one at a time, while the last one is more likely there than not; that last one is kept, for what is
-  too small to be seen.
+- Effects are added one at a time, while the last one is more likely there than not; that last one is kept.
 - All columns at work are asked of what the single effects leave, after them; their sizes have either sign.
 """
 
@@ -38,47 +35,24 @@ import numpy as np
 import scipy.special
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
-from sipe_bayes.core.options import Options, option
 from sipe_bayes.posterior.truncated_normal import interval_quantile
 
+ABSENT = 0.75  # prior probability that an effect is none; that not all columns are at work
 _FAR = 40.0  # sds beyond which a normal has no mass
-_SETTLED = 1e-3  # sds of a column, by which no effect changes any more
 
 
-@dataclass(frozen=True)
-class EffectOptions(Options):
-    """What is believed of effects beforehand."""
-
-    absent: float = option(0.75, "prior probability that an effect is none; that not all are at work", least=0)
-    scale: float = option(3.0, "of the half-Cauchy on the root of what it adds to chi-square", "sds", above=0)
-    smallest: float = option(0.3, "of the grid of that root", "sds", above=0)
-    largest: float = option(3000.0, "of the grid of that root", "sds", above=0)
-    sizes: int = option(25, "between these two, evenly in their logarithm", least=2)
-    effects: int = option(5, "single ones at most: a dozen small ones together explain anything", least=1)
-    alike: float = option(0.2, "of the likeliest one's probability, from which another is named beside it", least=0)
-    named: int = option(3, "that are named at most", least=1)
-    rounds: int = option(30, "over all effects at most, until they settle", least=1)
-
-    @property
-    def grid(self) -> tuple[FloatArray, FloatArray]:
-        """The sizes t (T,) and their prior probabilities."""
-        t = np.geomspace(self.smallest, self.largest, self.sizes)
-        density = t / (1 + (t / self.scale) ** 2)  # by logarithm
-        return t, density / density.sum()
-
-
-EFFECTS = EffectOptions()
+def size_grid() -> tuple[FloatArray, FloatArray]:
+    """The sizes t (25,), in sds, evenly in their logarithm, and their prior probabilities: half-Cauchy of scale 3."""
+    t = np.geomspace(0.3, 3000.0, 25)
+    density = t / (1 + (t / 3.0) ** 2)  # by logarithm
+    return t, density / density.sum()
 
 
 @dataclass(frozen=True)
 class Columns:
-    """K columns, all else projected out.
+    """K columns, all else projected out, with the names of the extensions that they belong to.
 
-    Args:
-        names: (K,) of the extensions that they belong to.
-        information: (K, K).
-        score: (K,).
-        one_sided: (K,) those whose size may not be negative.
+    Information (K, K), score (K,), and which (K,) may not have a negative size.
     """
 
     names: Sequence[str]
@@ -95,13 +69,10 @@ class Columns:
 
 @dataclass(frozen=True)
 class SingleEffect:
-    """One column at work, of any size, or none.
+    """One of some columns at work, of any size, or none.
 
-    Args:
-        weights: (T, K) probabilities of size and column.
-        mean: (T, K) and
-        sd: (T, 1) of the normal of the column's z, before it is cut off.
-        columns: that it is one of.
+    ``weights`` (T, K) are the probabilities of size and column, ``mean`` (T, K) and ``sd`` (T, 1) those of the normal
+    of the column's z, before it is cut off.
     """
 
     weights: FloatArray
@@ -110,15 +81,15 @@ class SingleEffect:
     columns: Columns
 
     @classmethod
-    def of(cls, columns: Columns, score: FloatArray, options: EffectOptions) -> SingleEffect:
+    def of(cls, columns: Columns, score: FloatArray) -> SingleEffect:
         """By what other effects leave of the score (K,)."""
-        t, believed = options.grid
+        t, believed = size_grid()
         z, shrunk = score / np.sqrt(np.diag(columns.information)), (t**2 / (1 + t**2))[:, None]
         evidence = -0.5 * np.log1p(t**2)[:, None] + 0.5 * shrunk * z**2
         half = np.log(2) + scipy.special.log_ndtr(np.sqrt(shrunk) * z)
         evidence = evidence + np.where(columns.one_sided, half, 0.0) + np.log(believed)[:, None]
-        evidence = evidence + np.log(columns.parts) + np.log1p(-options.absent)
-        total = np.logaddexp(np.log(options.absent), scipy.special.logsumexp(evidence))
+        evidence = evidence + np.log(columns.parts) + np.log1p(-ABSENT)
+        total = np.logaddexp(np.log(ABSENT), scipy.special.logsumexp(evidence))
         return cls(np.exp(evidence - total), shrunk * z, np.sqrt(shrunk), columns)
 
     @property
@@ -126,19 +97,19 @@ class SingleEffect:
         """The probability that it is not none."""
         return float(self.weights.sum())
 
-    def alike(self, names: Sequence[str]) -> list[str]:
-        """What it may be, the likeliest first: of the columns' names (K,) those that are hardly less likely."""
+    def alike(self) -> list[str]:
+        """What it may be: of the columns' names the likeliest, and two at most of a fifth of its probability."""
         chance: dict[str, float] = {}
-        for name, own in zip(names, self.by_column.tolist(), strict=True):
+        for name, own in zip(self.columns.names, self.by_column.tolist(), strict=True):
             chance[name] = chance.get(name, 0.0) + own
         ranked = sorted(chance, key=lambda name: -chance[name])
-        return [name for name in ranked if chance[name] >= EFFECTS.alike * chance[ranked[0]]][: EFFECTS.named]
+        return [name for name in ranked if chance[name] >= 0.2 * chance[ranked[0]]][:3]
 
     @property
     def against(self) -> float:
         """Nats that are against its likeliest column beforehand, rather than none."""
         parts = self.columns.parts[int(self.by_column.argmax())]
-        return float(np.log(EFFECTS.absent / ((1 - EFFECTS.absent) * parts)))
+        return float(np.log(ABSENT / ((1 - ABSENT) * parts)))
 
     @property
     def by_column(self) -> FloatArray:
@@ -171,16 +142,16 @@ class SingleEffect:
 class AllEffects:
     """All columns at once, each a little, or none."""
 
-    def __init__(self, columns: Columns, score: FloatArray, options: EffectOptions) -> None:
-        self.t, believed = options.grid
+    def __init__(self, columns: Columns, score: FloatArray) -> None:
+        self.t, believed = size_grid()
         self.scale = np.sqrt(columns.parts / np.diag(columns.information))
         values, self.axes = np.linalg.eigh(columns.information * np.outer(self.scale, self.scale))
         self.values, self.along = np.maximum(values, 0.0), self.axes.T @ (self.scale * score)
         square = self.t[:, None] ** 2
         grown = square / (1 + square * self.values)
         evidence = 0.5 * (grown * self.along**2 - np.log1p(square * self.values)).sum(1) + np.log(believed)
-        evidence = evidence + np.log1p(-options.absent)
-        total = np.logaddexp(np.log(options.absent), scipy.special.logsumexp(evidence))
+        evidence = evidence + np.log1p(-ABSENT)
+        total = np.logaddexp(np.log(ABSENT), scipy.special.logsumexp(evidence))
         self.weights = np.exp(evidence - total)
 
     def draws(self, count: int, random: np.random.Generator) -> FloatArray:
@@ -200,41 +171,43 @@ class Effects:
     every: AllEffects
 
     @property
+    def seen(self) -> list[SingleEffect]:
+        """Those that are more likely there than not."""
+        return [effect for effect in self.single if effect.present > 0.5]
+
+    @property
     def sizes(self) -> FloatArray:
-        """(K,) means of what single effects are more likely there than not."""
-        seen = [effect.sizes for effect in self.single if effect.present > 0.5]
-        return np.sum(seen, axis=0) if seen else np.zeros(len(self.every.scale))
+        """(K,) means of these."""
+        return np.sum([effect.sizes for effect in self.seen], axis=0) if self.seen else np.zeros(len(self.every.scale))
 
 
-def find_effects(columns: Columns, options: EffectOptions = EFFECTS) -> Effects:
+def find_effects(columns: Columns) -> Effects:
     """The effects' posterior, by coordinate ascent: each is fitted to what the others leave (Wang et al., section 3.2).
 
-    Args:
-        columns: K of them, with information each.
-        options: of the prior.
+    Five single ones at most: a dozen small ones together explain anything.
     """
     effects = list[SingleEffect]()
-    for _ in range(options.effects):
-        more = _settled(columns, effects, options)
+    for _ in range(5):
+        more = _settled(columns, effects)
         if sum(effect.present <= 0.5 for effect in more) > 1:  # the new one shares what another had
             break
         effects = more
         if min(effect.present for effect in effects) <= 0.5:
             break
     left = columns.score - columns.information @ sum(effect.sizes for effect in effects)
-    return Effects(tuple(sorted(effects, key=lambda e: -e.present)), AllEffects(columns, left, options))
+    return Effects(tuple(sorted(effects, key=lambda e: -e.present)), AllEffects(columns, left))
 
 
-def _settled(columns: Columns, effects: Sequence[SingleEffect], options: EffectOptions) -> list[SingleEffect]:
-    """These and a new one, each fitted to what the others leave until they settle."""
+def _settled(columns: Columns, effects: Sequence[SingleEffect]) -> list[SingleEffect]:
+    """These and a new one, each fitted to what the others leave, until none changes by a thousandth of an sd."""
     made, sd = list(effects), np.sqrt(np.diag(columns.information))
     sizes = np.array([*(effect.sizes for effect in effects), np.zeros(len(columns.score))])
-    for _ in range(options.rounds):
+    for _ in range(30):
         before = sizes.copy()
         for k in reversed(range(len(sizes))):
             rest = sizes.sum(0) - sizes[k]
-            made[k : k + 1] = [SingleEffect.of(columns, columns.score - columns.information @ rest, options)]
+            made[k : k + 1] = [SingleEffect.of(columns, columns.score - columns.information @ rest)]
             sizes[k] = made[k].sizes
-        if (np.abs(sizes - before) * sd).max() < _SETTLED:
+        if (np.abs(sizes - before) * sd).max() < 1e-3:
             break
     return made

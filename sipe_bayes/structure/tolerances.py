@@ -1,9 +1,7 @@
 """Numbers that no machine has exactly, and that often no motion tells: forces, drawings, clocks.
 
 A machine whose motors give a tenth more than the log says, with masses, inertias and friction a tenth larger, moves
-alike; and so does one with a lighter link whose centre of mass lies further out. Joints that are read one after the
-other at one time stamp look like servos that are softer from one to the next. Theta's answer to a number that is off by
-its tolerance is then what values are unknown by beside all that the logs tell.
+alike. Theta's answer to a number that is off by its tolerance is what values are unknown by beside all that logs tell.
 """
 
 from __future__ import annotations
@@ -11,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
-
-from sipe_bayes.structure.extensions.numerics import PhysicsStep
 
 if TYPE_CHECKING:
     from sipe_bayes.structure.probes import Probe
@@ -22,12 +18,9 @@ if TYPE_CHECKING:
 class Tolerances:
     """Sds of numbers that no machine has exactly; by default all are exact.
 
-    Args:
-        commands: of what each actuator delivers, as a share of what its command says.
-        geometry: of where a body's centre of mass lies, as a share of its ``reach`` (``structure.machine``), and of a
-            mass that is not unknown, as a share of it.
-        timing: of when a measurement was taken, as a share of the time from sample to sample.
-        physics_step: of what physics steps change, as a share of all that they do: a machine takes none.
+    ``commands``: of what each actuator delivers, as a share of what its command says. ``geometry``: of where a body's
+    centre of mass lies, as a share of its ``reach``, and of a mass that is not unknown. ``timing``: of when a
+    measurement was taken, as a share of the time between samples. ``physics_step``: as a share of all that steps do.
     """
 
     commands: Mapping[str, float] = field(default_factory=dict)
@@ -37,10 +30,8 @@ class Tolerances:
 
     def of(self, probe: Probe) -> float:
         """The sd of the number that a probe changes."""
-        if probe.extension is None:
-            return 0.0
-        if isinstance(probe.extension, PhysicsStep):
-            return self.physics_step * PhysicsStep.shorter / (PhysicsStep.shorter - 1)
+        if probe.is_step:  # n times as short it changes (n - 1)/n of all that steps do
+            return self.physics_step * probe.extension.slow / (probe.extension.slow - 1)
         shares = {"body": self.geometry, "channel": self.timing, "actuator": self.commands.get(probe.site, 0.0)}
         return shares.get(probe.extension.kind, 0.0)
 

@@ -17,7 +17,7 @@ from sipe_bayes.likelihood import Noise, Segments, bind
 from sipe_bayes.posterior import GaussianMixture
 from sipe_bayes.structure.augmented import AtNoise, AugmentedModel
 from sipe_bayes.structure.discrepancy import (
-    DISCREPANCY,
+    DIFFER,
     Discrepancy,
     LogEstimate,
     Spread,
@@ -25,7 +25,7 @@ from sipe_bayes.structure.discrepancy import (
     find_discrepancy,
     parts_of,
 )
-from sipe_bayes.structure.single_effects import EFFECTS
+from sipe_bayes.structure.single_effects import size_grid
 from tests.problems.pendulums import log, pendulum
 
 SD = 0.01
@@ -142,9 +142,9 @@ def agreeing(count: int, apart: float, seed: int) -> list[LogEstimate]:
 def test_the_spread_between_logs_has_its_exact_posterior() -> None:
     """By the densities of the logs' values with a flat mean integrated out, written out."""
     logs = agreeing(4, 2.0, 0)
-    grid, believed = EFFECTS.grid
+    grid, believed = size_grid()
     times = np.append(0.0, grid)
-    prior = np.append(1 - DISCREPANCY.differ, DISCREPANCY.differ * believed)
+    prior = np.append(1 - DIFFER, DIFFER * believed)
     values, covariance = np.concatenate([one.mean for one in logs]), np.linalg.inv(logs[0].information)
     common = 1e4 * np.tile(np.eye(2), (4, 4))
     own = [np.kron(np.eye(4), (1 + t**2) * covariance) + common for t in times]

@@ -16,12 +16,12 @@ from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.envs.export import write_identified
 from sipe_bayes.envs.internal.elastic import NUMBERS as ELASTIC_NUMBERS
 from sipe_bayes.envs.laws.registry import LAWS
+from sipe_bayes.envs.laws.residual import Residual
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import Placed, extended, placements
-from sipe_bayes.structure.extensions.world import Residual
 from sipe_bayes.structure.machine import Machine, machine_of
 from sipe_bayes.structure.probes import effects
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension

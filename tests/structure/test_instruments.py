@@ -13,8 +13,8 @@ from sipe_bayes.likelihood import Segments
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import extended, members, placements
-from sipe_bayes.structure.extensions.world import SensorDelay
 from sipe_bayes.structure.machine import machine_of
+from sipe_bayes.structure.registry import get_extension
 
 BLIMP = """<mujoco><option timestep="0.01"/><worldbody><body name="hull" gravcomp="1"><freejoint/>
   <geom type="ellipsoid" size=".4 .2 .2" mass=".5"/><site name="nose" pos=".4 0 0"/></body></worldbody>
@@ -33,7 +33,7 @@ def test_the_pose_of_a_body_comes_late_as_a_whole(named: bool) -> None:
     simulator, pushes = Simulator(environment, 1), np.random.default_rng(0).normal(0, 0.2, (50, 1))
     log = simulator.rollout(np.array([0.3]), pushes, simulator.default_state(), dt=0.02)[0]
     windows = Windows(Segments(), simulator, Trajectories.stack([log]))
-    placed = list(placements(SensorDelay(), machine_of(windows, np.array([0.3]), windows.no_starts())))
+    placed = list(placements(get_extension("sensor_delay"), machine_of(windows, np.array([0.3]), windows.no_starts())))
     orientation = [name for name in environment.channels if "orientation" in name]
     sizes = sorted(len(members(one.site)) for one in placed)
     assert sizes == [1, 1, 1, 1, 1, 2, 6]

@@ -24,10 +24,9 @@ from sipe_bayes.structure.augmented import AugmentedModel
 from sipe_bayes.structure.candidates import rank_candidates
 from sipe_bayes.structure.discrepancy import find_discrepancy
 from sipe_bayes.structure.extension import placements
-from sipe_bayes.structure.extensions.numerics import PhysicsStep
 from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.probes import effects
-from sipe_bayes.structure.registry import EXTENSIONS
+from sipe_bayes.structure.registry import EXTENSIONS, get_extension
 from sipe_bayes.structure.tolerances import EXACT, Tolerances
 from tests.problems.pendulums import DT, log, pendulum, stepped
 
@@ -68,7 +67,7 @@ def lead_since(begin: float, step: float = 0.005, dt: float = 0.02) -> FloatArra
 
 def change(windows: Windows, theta: FloatArray) -> FloatArray | None:
     """Of the predictions (W, L, C); None where nothing can be said."""
-    own = list(placements(PhysicsStep(), machine_of(windows, theta, windows.no_starts())))
+    own = list(placements(get_extension("physics_step"), machine_of(windows, theta, windows.no_starts())))
     found = effects(windows, theta, windows.no_starts(), own)
     return found[0].change[..., 0] if found else None
 
@@ -156,7 +155,7 @@ def test_a_step_of_which_the_logs_tell_is_not_untold() -> None:
     for seed in (1, 2, 3, 4):
         logs, *_ = fitted(DT, seed)
         assert untold(find_discrepancy(logs, ALLOWED)) == []
-        (k,) = (k for k, probe in enumerate(logs.probes) if isinstance(probe.extension, PhysicsStep))
+        (k,) = (k for k, probe in enumerate(logs.probes) if probe.is_step)
         signs.add(bool(logs.seen.projected.score[k] > 0))
     assert signs == {True, False}
 
@@ -226,7 +225,7 @@ def test_what_shorter_steps_promise_is_about_what_they_gain(truth: float, least:
     fitting = among(log(machine, [0.6, 0.08], 2, sd=0.002)).search.fitting
     plain = fitting.fit([], None, 2000)
     windows = fitting.windows(simulator)
-    pieces = list(placements(PhysicsStep(), machine_of(windows, plain.theta, plain.starts)))
+    pieces = list(placements(get_extension("physics_step"), machine_of(windows, plain.theta, plain.starts)))
     at = plain.theta, plain.noise, plain.starts, QuadraticPrior.of(fitting.prior)
     ((gain, one),) = (
         (max(candidate.gain, 0.0), fitting.fit(pieces, plain.theta, 2000))

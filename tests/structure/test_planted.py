@@ -16,7 +16,7 @@ from sipe_bayes.envs.internal.elastic import Base, Elastic, Gear, Link
 from sipe_bayes.envs.mjcf import Edit, MjcfEnvironment
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure import Restriction, discover
-from sipe_bayes.structure.extensions.actuator import FilteredCommand
+from sipe_bayes.structure.extensions.sites import FilteredCommand
 from tests.problems.machines import MACHINES, environment
 from tests.problems.pendulums import XML, log, pendulum
 

@@ -16,10 +16,10 @@ from sipe_bayes.structure import Restriction, discover
 from sipe_bayes.structure.augmented import AugmentedModel
 from sipe_bayes.structure.discrepancy import find_discrepancy
 from sipe_bayes.structure.extension import Extension, members, placements
-from sipe_bayes.structure.extensions.actuator import FilteredCommand, Lag
-from sipe_bayes.structure.extensions.world import SensorFilter
+from sipe_bayes.structure.extensions.sites import FilteredCommand
 from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.probes import effects, imitating
+from sipe_bayes.structure.registry import get_extension
 from tests.problems.machines import MACHINES, environment
 from tests.problems.pendulums import log, pendulum
 
@@ -90,9 +90,9 @@ def double(*targets: str) -> Windows:
 
 
 SHARED = [
-    (Lag(), ["actuator:m1.delay", "actuator:m2.delay"], "m1 and\u00a0m2", "actuator:{}.lag"),
+    (get_extension("lag"), ["actuator:m1.delay", "actuator:m2.delay"], "m1 and\u00a0m2", "actuator:{}.lag"),
     (
-        SensorFilter(),
+        get_extension("sensor_filter"),
         ["sensor:joint:shoulder.position.delay", "sensor:joint:elbow.position.delay"],
         "joint:shoulder.position and\u00a0joint:elbow.position",
         "sensor:{}.filter",
@@ -124,9 +124,10 @@ def test_nothing_is_taken_from_a_parameter_at_its_bound_nor_from_one_of_other_ta
     space, starts = windows.simulator.space, windows.no_starts()
     for theta, far in ((0.5, 0.05), (0.0, 0.008)):
         at = np.array([0.5, theta])
-        (first, second) = placements(Lag(), machine_of(windows, at, starts))
+        (first, second) = placements(get_extension("lag"), machine_of(windows, at, starts))
         for one, step, trade in ((first, far, -far * (far == 0.05) / 0.1), (second, 0.008, 0.0)):
             (effect,) = effects(windows, at, starts, [one])
             assert float(one.parameters[0].value(effect.probes[0, 0])) == pytest.approx(step)
             np.testing.assert_allclose(effect.trades, [[0.0, trade]])
-    assert [imitating(Lag(), site, tuple(space)) for site in ("m1", "m2", "m1 and\u00a0m2")] == [1, None, 1]
+    lag, sites = get_extension("lag"), ("m1", "m2", "m1 and\u00a0m2")
+    assert [imitating(lag, site, tuple(space)) for site in sites] == [1, None, 1]

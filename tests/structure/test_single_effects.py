@@ -7,9 +7,8 @@ import pytest
 import scipy.stats
 
 from sipe_bayes.core.arrays import FloatArray
-from sipe_bayes.structure.single_effects import AllEffects, Columns, EffectOptions, SingleEffect, find_effects
+from sipe_bayes.structure.single_effects import ABSENT, AllEffects, Columns, SingleEffect, find_effects, size_grid
 
-OPTIONS = EffectOptions()
 DRAWS = 40_000
 NAMES = ["a", "b", "b", "c", "c", "c"]
 PARTS = np.array([1 / 3, 1 / 6, 1 / 6, 1 / 9, 1 / 9, 1 / 9])
@@ -36,15 +35,15 @@ def test_the_posterior_of_one_or_of_all_is_the_exact_one_of_a_linear_model(size:
     """Evidence of each state from normals of y written out, a half normal's by quadrature; then the first's shift."""
     columns, y = regression(3, size)
     information, score, answer = projected(columns, y)
-    rest, (grid, believed) = columns[:, 1:], OPTIONS.grid
+    rest, (grid, believed) = columns[:, 1:], size_grid()
     flat = np.eye(60) + 1e4 * np.outer(columns[:, 0], columns[:, 0])
     inverse, sds = np.linalg.inv(flat), 1 / np.sqrt(np.diag(information))
 
     def level(left: FloatArray) -> FloatArray:
         return np.asarray(-0.5 * np.einsum("...i,ij,...j->...", left, inverse, left))
 
-    one, every = [[(OPTIONS.absent, 0.0, 0.0)] for _ in range(2)]
-    for t, probable in zip(grid, (1 - OPTIONS.absent) * believed, strict=True):
+    one, every = [[(ABSENT, 0.0, 0.0)] for _ in range(2)]
+    for t, probable in zip(grid, (1 - ABSENT) * believed, strict=True):
         for k in range(6):
             b = (sds[k] * (y @ inverse @ rest[:, k]) * sds[k]) + sds[k] * np.linspace(-10, 10, 1001)
             sizes = scipy.stats.norm.pdf(b, scale=t * sds[k]) * np.where(ONE_SIDED[k], 2.0 * (b > 0), 1.0)
@@ -64,7 +63,7 @@ def test_the_posterior_of_one_or_of_all_is_the_exact_one_of_a_linear_model(size:
     for rows, made in ((one, SingleEffect.of), (every, AllEffects)):
         weights, means, squares = (np.array(column) for column in zip(*rows, strict=True))
         weights = weights / weights.sum()
-        seen = made(columns_seen, score, OPTIONS)
+        seen = made(columns_seen, score)
         assert isinstance(seen, SingleEffect | AllEffects)
         np.testing.assert_allclose(seen.weights.sum(), 1 - weights[0], atol=1e-3)
         shifts, mean, square = seen.draws(DRAWS, np.random.default_rng(0)) @ answer, weights @ means, weights @ squares
@@ -76,12 +75,12 @@ def test_the_posterior_of_one_or_of_all_is_the_exact_one_of_a_linear_model(size:
 
 def test_intervals_hold_as_often_as_they_say_and_are_hardly_wider_where_nothing_is_missing() -> None:
     """300 logs, one effect or none drawn from the prior: 90 % but for three standard errors of 1.7 %."""
-    random, (grid, believed) = np.random.default_rng(0), OPTIONS.grid
+    random, (grid, believed) = np.random.default_rng(0), size_grid()
     hits, plain, widths, missing = [], [], [], []
     for seed in range(300):
         columns, y = regression(seed, 0.0)
         information, _, answer = projected(columns, y)
-        t, present = random.choice(grid, p=believed), random.uniform() > OPTIONS.absent
+        t, present = random.choice(grid, p=believed), random.uniform() > ABSENT
         sizes = t / np.sqrt(np.diag(information)) * random.standard_normal(6)
         sizes = np.where(ONE_SIDED, np.abs(sizes), sizes) * (np.arange(6) == random.choice(6, p=PARTS))
         y = y + columns[:, 1:] @ (sizes * present)

@@ -25,7 +25,6 @@ from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.structure.augmented import AugmentedModel
 from sipe_bayes.structure.discovery import FEWEST_APART
 from sipe_bayes.structure.discrepancy import Discrepancy, LogEstimate, draw_differing, find_discrepancy
-from sipe_bayes.structure.extensions.numerics import PhysicsStep
 
 _NAMED = 3  # numbers whose error the logs do not show
 
@@ -139,7 +138,7 @@ def untold(found: Discrepancy) -> list[Finding]:
         what = one.sentence[0].upper() + one.sentence[1:]
         said.append(f"{what} cannot be seen in these logs. It would bias {', '.join(moved)}.")
     for one in moving:
-        if not isinstance(one.probe.extension, PhysicsStep):  # the interval allows for steps
+        if not one.probe.is_step:  # the interval allows for steps
             hangs |= one.moves(sd)
     if len(said) > 1:
         said[0] += " Measure that first: nothing else moves a value as far."

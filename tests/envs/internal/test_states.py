@@ -16,7 +16,7 @@ from sipe_bayes.likelihood import Segments, StateSpace
 from sipe_bayes.likelihood.state_space.chain import Chain
 from sipe_bayes.likelihood.windows import Windows
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.extensions.actuator import FilteredCommand
+from sipe_bayes.structure.extensions.sites import FilteredCommand
 from tests.problems.machines import MACHINES, environment
 
 
