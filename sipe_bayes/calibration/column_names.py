@@ -80,11 +80,17 @@ class Dialect(BaseModel, extra="forbid"):
             for key in {*given} - {*legal}:
                 raise problem(f"unknown; {nearest(key, legal)}", field, key)
         for pattern, value in self.patterns.items():
-            kind, _, unit = value.removesuffix(" measured").partition(" ")
-            if value not in _UNITS and not (kind in [*Kind] and unit in ("", *_UNITS)):
-                wrong = f"expected a kind, a unit or both, got {value!r}; {nearest(kind, Kind)}"
+            kind, unit, _ = _read_value(value)
+            if unit not in (_UNITS if kind is None else ("", *_UNITS)):
+                wrong = f"expected a kind, a unit or both, got {value!r}; {nearest(value.partition(' ')[0], Kind)}"
                 raise problem(wrong, "patterns", pattern)
         return self
+
+
+def _read_value(value: str) -> tuple[Kind | None, str, bool]:
+    """The kind and unit that a pattern stands for, and whether it is measured."""
+    kind, _, unit = value.removesuffix(" measured").partition(" ")
+    return (Kind(kind), unit, value.endswith(" measured")) if kind in [*Kind] else (None, value, False)
 
 
 @dataclass(frozen=True)
@@ -93,7 +99,7 @@ class Vocabulary:
 
     kinds: dict[str, set[str]]
     units: dict[str, str]
-    patterns: list[tuple[re.Pattern[str], str]]
+    patterns: list[tuple[re.Pattern[str], Kind | None, str, bool]]
     rules: list[tuple[Kind, str]]
 
     def of(self, *kinds: str) -> set[str]:
@@ -119,7 +125,7 @@ def read_vocabulary() -> Vocabulary:
     return Vocabulary(
         kinds,
         {word: unit for unit, words in spelt for word in words.split()},
-        [(_compile(pattern), value) for dialect in (*own, *given) for pattern, value in dialect.patterns.items()],
+        [(_compile(text), *_read_value(value)) for part in (*own, *given) for text, value in part.patterns.items()],
         [rule for dialect in (*own, *given) for rule in dialect.rules],
     )
 
@@ -149,7 +155,8 @@ _BRACKETED = re.compile(r"[\[(]\s*([^\])\d]*?[/^]?[^\])]*?)\s*[\])]")
 
 def read_name(column: str, own: Collection[str] = ()) -> Label:
     """What a name says; own: words that name something of the model, whatever quantity they are elsewhere."""
-    found, kind, fixed, measured = _find_pattern(column)
+    patterns = ((p.fullmatch(column), kind, unit, said) for p, kind, unit, said in read_vocabulary().patterns)
+    found, kind, fixed, measured = next((row for row in patterns if row[0]), (None, None, "", False))
     unit, words, numbers = _split_unit(column.translate(_GREEK), own)
     unit = fixed or unit
     named, words = [word for word in words if word in own], [word for word in words if word not in own]
@@ -196,16 +203,6 @@ def spell_unit(pieces: list[str]) -> str:
         rate = f"{units.get(pieces[0])}/s"
         return rate if rate in UNITS else ""
     return units.get("_".join(pieces), "")
-
-
-def _find_pattern(column: str) -> tuple[re.Match[str] | None, Kind | None, str, bool]:
-    """The first pattern of a dialect that fits a whole name, with its kind and unit, and whether it is measured."""
-    for pattern, value in read_vocabulary().patterns:
-        if found := pattern.fullmatch(column):
-            kind, _, unit = value.removesuffix(" measured").partition(" ")
-            measured = value.endswith(" measured")
-            return (found, Kind(kind), unit, measured) if kind in [*Kind] else (found, None, value, False)
-    return None, None, "", False
 
 
 def _split_unit(plain: str, own: Collection[str]) -> tuple[str, list[str], list[int]]:

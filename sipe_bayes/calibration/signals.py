@@ -44,8 +44,7 @@ def slope_of(position: FloatArray, velocity: FloatArray, dt: float = 1.0) -> Slo
     way = (position[span:] - position[:-span]) / (span * dt)
     total = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]))])
     mean = (total[span:] - total[:-span]) / span
-    shares = np.array([_explain(way, mean, lag) for lag in range(-2, min(_LATEST, len(way) // 4) + 1)])
-    best = int(np.argmax(shares))
+    shares, best = _shares_of(way, mean, range(-2, min(_LATEST, len(way) // 4) + 1))
     lag = float(best - 2)
     if 0 < best < len(shares) - 1 and (bend := shares[best - 1] - 2 * shares[best] + shares[best + 1]) < 0:
         lag += 0.5 * (shares[best - 1] - shares[best + 1]) / bend
@@ -61,8 +60,8 @@ def likeness(command: FloatArray, measured: FloatArray) -> Likeness:
     a, b = command[known], measured[known]
     if len(a) < _FEWEST or np.ptp(a) == 0 or np.ptp(b) == 0:
         return Likeness(1.0, 0.0)
-    shares = [_explain(a, b, lag) for lag in range(min(_LATEST, len(a) // 4))]
-    x, y = _shift(a, b, best := int(np.argmax(shares)))
+    shares, best = _shares_of(a, b, range(min(_LATEST, len(a) // 4)))
+    x, y = _shift(a, b, best)
     return Likeness(float(x @ y) / max(float(y @ y), 1e-300), float(shares[best]))
 
 
@@ -71,10 +70,12 @@ def _shift(way: FloatArray, mean: FloatArray, lag: int) -> tuple[FloatArray, Flo
     return a - a.mean(), b - b.mean()
 
 
-def _explain(way: FloatArray, mean: FloatArray, lag: int) -> float:
-    a, b = _shift(way, mean, lag)
-    size = float((a @ a) * (b @ b))
-    return float((a @ b) ** 2 / size) if size > 0 else 0.0
+def _shares_of(way: FloatArray, mean: FloatArray, lags: range) -> tuple[FloatArray, int]:
+    """The share of variance that one explains of the other at each lag, and where it is largest."""
+    pairs = [_shift(way, mean, lag) for lag in lags]
+    sizes = [float((a @ a) * (b @ b)) for a, b in pairs]
+    shares = [float((a @ b) ** 2 / size) if size > 0 else 0.0 for (a, b), size in zip(pairs, sizes, strict=True)]
+    return np.array(shares), int(np.argmax(shares))
 
 
 def turn_of(values: FloatArray) -> float:

@@ -302,6 +302,8 @@ MACHINES: dict[str, Plant] = {
       (0.3,), (0.5,), 0.01, 900, 2, dry=(5,), start=(0.5,), hold=(2500,)),
     "turned_pair": Plant(model(ARM, drives(POS, SE, 'kp="150" kv="3"')), of("position[{i}] goal[{i}]", POSE, SE, "rad",
       "-+", noise=1e-3), (0.6, 0.8), (0.2, 0), 0.02, 800, 3, ("timestamp", "ns"), 0.12, (0.2, 0.1), pace=1.2),
+    "slipped_encoder": Plant(model(ARM, drives(POS, SE, 'kp="25" kv="2"')), (*of("{j}_pos", POS, "shoulder", noise=5e-4,
+      zero=0.7), *of("{j}_pos", POS, "elbow", noise=5e-4), *of("{j}_goal", C, SE)), (0.8, 0.8)),
     "mrad_arm": Plant(model(ARM, drives("motor", SE)), (*of("q{i}_mrad", "position", SE, "mrad", "+-", step=1), *of(
       "tau{i}", C, SE, "N m", "--", step=0.001)), (0.8, 0.9), (), 0.004, 1500, 3, dry=(0.1, 0.05), hold=(8, 1.2)),
     "odrive_turns": Plant(model(chain("hinge y .2,0,0 .4"), drives(POS, "hinge", 'kp="1" kv=".2"')), of(

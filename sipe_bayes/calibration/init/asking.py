@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from sipe_bayes.calibration.init.draft import Draft, Reading, turned
@@ -31,12 +32,12 @@ def choices_of(draft: Draft) -> list[Choice]:
             columns = ", ".join(map(repr, reading.match.columns))
             factor = f", factor {reading.factor:g}" if reading.factor != 1 else ""
             now = f"as proposed: unit {reading.unit}, sign {reading.sign}{factor}"
-            changes = (_settled(k, ()), *(_settled(k, lines) for lines in others))
+            changes = tuple(partial(_settle, k=k, lines=lines) for lines in ((), *others))
             answers = (now, *("; ".join(lines) for lines in others))
             out.append(Choice(f"{columns}: {'; '.join(reading.doubts)}", answers, changes))
     for group in draft.together:
         text = f"{' and '.join(map(repr, group))}: sign ambiguity: flipped together they fit equally well"
-        out.append(Choice(text, ("as proposed", "flipped"), (lambda d: d, _flipped(group))))
+        out.append(Choice(text, ("as proposed", "flipped"), (lambda d: d, partial(_flip, columns=group))))
     return out
 
 
@@ -58,19 +59,15 @@ def _alternatives(lines: Sequence[str]) -> list[tuple[str, ...]]:
     return [tuple(own) for own in out]
 
 
-def _settled(k: int, lines: Sequence[str]) -> Callable[[Draft], Draft]:
-    """Reading number ``k`` with these lines in its table, and nothing open."""
-
-    def change(draft: Draft) -> Draft:
-        keys, own, readings = tomllib.loads("\n".join(lines)), draft.readings[k], list(draft.readings)
-        readings[k] = replace(_with_keys(own, keys), doubts=(), instead=())
-        for place, other in enumerate(draft.readings):  # a set-point is read as the position that follows it
-            tied = (own.match.column, other.match.column) in draft.tied and "unit" in keys
-            if tied and (own.unit, own.factor) == (other.unit, other.factor):
-                readings[place] = _with_keys(other, {key: value for key, value in keys.items() if key != "sign"})
-        return draft.with_readings(readings)
-
-    return change
+def _settle(draft: Draft, k: int, lines: Sequence[str]) -> Draft:
+    """The draft with these lines in the table of reading ``k``, and nothing open of it."""
+    keys, own, readings = tomllib.loads("\n".join(lines)), draft.readings[k], list(draft.readings)
+    readings[k] = replace(_with_keys(own, keys), doubts=(), instead=())
+    for place, other in enumerate(draft.readings):  # a set-point is read as the position that follows it
+        tied = (own.match.column, other.match.column) in draft.tied and "unit" in keys
+        if tied and (own.unit, own.factor) == (other.unit, other.factor):
+            readings[place] = _with_keys(other, {key: value for key, value in keys.items() if key != "sign"})
+    return draft.with_readings(readings)
 
 
 def _with_keys(reading: Reading, keys: dict[str, Any]) -> Reading:
@@ -87,13 +84,9 @@ def _with_keys(reading: Reading, keys: dict[str, Any]) -> Reading:
     return replace(reading, match=match, **numbers).turned_to(keys.get("sign", reading.sign))
 
 
-def _flipped(columns: Sequence[str]) -> Callable[[Draft], Draft]:
-    """Columns with the other sign, and all else that is measured of their joints."""
-
-    def change(draft: Draft) -> Draft:
-        joints = {r.match.target.rpartition(".")[0] for r in draft.readings if r.match.column in columns} - {""}
-        turn = [r.match.column in columns or r.match.target.rpartition(".")[0] in joints for r in draft.readings]
-        pairs = zip(draft.readings, turn, strict=True)
-        return draft.with_readings([r.turned_to(turned(r.sign)) if own else r for r, own in pairs])
-
-    return change
+def _flip(draft: Draft, columns: Sequence[str]) -> Draft:
+    """The draft with the other sign of columns, and of all else that is measured of their joints."""
+    joints = {r.match.target.rpartition(".")[0] for r in draft.readings if r.match.column in columns} - {""}
+    turn = [r.match.column in columns or r.match.target.rpartition(".")[0] in joints for r in draft.readings]
+    pairs = zip(draft.readings, turn, strict=True)
+    return draft.with_readings([r.turned_to(turned(r.sign)) if own else r for r, own in pairs])

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -57,33 +56,27 @@ class Case:
 
     Args:
         draft: of positions and commands.
+        model: as it is given.
         machine: what of it logs hold.
         regression: of logs as the draft reads them.
         channels: of each reading; empty where the regression has none.
         commands: number of each reading's actuator; None of measurements.
+        count: independent numbers of each degree of freedom; by the motion to begin with.
         minus: pairs of channels, the second of which is taken off the first.
         tell: how far it is.
-        count: independent numbers of each degree of freedom; by the motion to begin with.
+        known: outcomes of assumptions that were tried.
     """
 
     draft: Draft
+    model: mujoco.MjModel
     machine: Machine
     regression: Regression
     channels: tuple[tuple[int, ...], ...]
     commands: tuple[int | None, ...]
+    count: float
     minus: tuple[tuple[int, int], ...] = ()
     tell: Tell = silent
-    count: float = 0.0
     known: dict[Assumption, Outcome] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.count = self.count or self.regression.count
-
-    def again(self, minus: tuple[tuple[int, int], ...] = ()) -> Case:
-        """The case of another regression, or with channels taken off others."""
-        out = copy(self)
-        out.minus, out.known = minus, {}
-        return out
 
     def outcome(self, readings: Readings) -> Outcome:
         """What the regression says of other units, signs and zeros than the draft's."""
@@ -116,6 +109,11 @@ class Case:
     def dof(self, k: int) -> int:
         """The degree of freedom of a joint's reading."""
         return int(self.regression.simulator.model.joint(self.draft.readings[k].joint).dofadr[0])
+
+    def explains_nothing(self, outcome: Outcome) -> bool:
+        """Whether hardly any force is explained, though not every joint follows a set-point against friction."""
+        known, served = self.regression.known, {self.dof(place) for place, _ in self.ties.values()}
+        return not known.any() or bool(outcome.miss[known].min() > 0.9 and {*np.flatnonzero(known)} - served)
 
     @cached_property
     def positions(self) -> dict[int, Joint]:
@@ -231,8 +229,8 @@ class Search:
                 unlikely = 0.7 * sum(a != q.answers[0] for q, a in zip(self.asked, answers, strict=True))
                 self.tried[answers] = unlikely + self.case.odd_sizes(readings), self.case.outcome(readings)
 
-    def run(self) -> None:
-        """All combinations, or where they are many those that changes of one answer or of two signs lead to."""
+    def run(self) -> Search:
+        """Try all combinations, or where they are many those that changes of one answer or of two signs lead to."""
         self.add([tuple(question.answers[0] for question in self.asked)])
         few = np.prod([float(len(question.answers)) for question in self.asked]) <= 64
         self.add(list(itertools.product(*(question.answers for question in self.asked))) if few else [])
@@ -245,6 +243,7 @@ class Search:
             if self.best == now:
                 break
         self.case.count = self.case.regression.independent(self.outcome)
+        return self
 
     def single_changes(self) -> list[Answers]:
         """The best answers with another one to one question."""
@@ -254,8 +253,7 @@ class Search:
     def flipped_pairs(self) -> list[Answers]:
         """The best answers with two signs flipped, and with all."""
         signs, now = [q for q, question in enumerate(self.asked) if question.of_sign], self.best
-        groups = [*itertools.islice(itertools.combinations(signs, 2), 40), signs]
-        return [tuple(turned(a) if q in group else a for q, a in enumerate(now)) for group in groups]
+        return [_flip(now, group) for group in (*itertools.islice(itertools.combinations(signs, 2), 40), signs)]
 
     def rival(self, question: int, answer: Answer) -> tuple[float, Answers]:
         """By how many nats of the logs the best combination with another answer is worse, and the nearest of these."""
@@ -282,6 +280,11 @@ class Search:
         return list(dict.fromkeys(group for group in groups if len(group) > 1))
 
 
+def _flip(answers: Answers, group: Sequence[int]) -> Answers:
+    """Answers with the signs of some questions flipped."""
+    return tuple(turned(a) if q in group else a for q, a in enumerate(answers))
+
+
 def _with_tied(case: Case, readings: Readings) -> list[Reading]:
     """Set-points in the unit and the direction of the position that follows them."""
     out = list(readings)
@@ -305,13 +308,11 @@ def search_answers(case: Case) -> Search:
     asked = questions(case.draft, case.machine)
     open_ = [tuple(k for k in q.readings if k not in case.ties and case.drive(k) in (None, *SERVOS)) for q in asked]
     asked = [replace(question, readings=own) for question, own in zip(asked, open_, strict=True) if own]
-    search = Search(case, asked)
-    search.run()
+    search = Search(case, asked).run()
     left = search.outcome.miss[case.regression.known]
     if len(left) and left.max() > _EXPLAINED:
         case.regression.springs = True
-        sprung = Search(case.again(), asked)
-        sprung.run()
+        sprung = Search(replace(case, known={}), asked).run()
         sprung.case.count = case.count
         believed = sprung.outcome.miss[case.regression.known].max() < _EXPLAINED
         if believed and search.nats(search.best) - sprung.nats(sprung.best) > 6 * len(left):
@@ -323,8 +324,7 @@ def search_answers(case: Case) -> Search:
 def decide(search: Search) -> Draft:
     """The draft with the units and signs that explain most, their evidence, and what stays open."""
     case, draft, outcome = search.case, search.case.draft, search.outcome
-    known = case.regression.known
-    if not known.any() or outcome.miss[known].min() > 0.9:
+    if case.explains_nothing(outcome):
         readings = _with_tied(case, draft.readings)
         text = "the model explains nothing of these logs, so units and signs stand on names alone"
         doubts = (*draft.doubts, f"{text}; look at the model and at what drives it", *list_guesses(readings))
@@ -447,25 +447,30 @@ def _as_force(case: Case, reading: Reading, gain: float, error: float, one_way: 
 
 
 class Zero(NamedTuple):
-    """A zero of a joint's column: its place, that of a set-point that has it too, SI, the sign, and why it may be."""
+    """A zero of a joint's column: its place, that of a set-point that has it too, SI, why it may be, and the sign."""
 
     k: int
     follower: int | None
     value: float
-    sign: int
     why: str = ""
+    sign: int = 1
     unsure: float = 0.0
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """Of the columns that have it."""
+        return (self.k,) if self.follower is None else (self.k, self.follower)
 
     def put(self, readings: Readings) -> list[Reading]:
         """Columns that read the value, in the model's direction, where the joint is at 0."""
         out, turn = list(readings), self.sign * readings[self.k].sign
-        for place in (self.k, *([] if self.follower is None else [self.follower])):
+        for place in self.places:
             one = replace(out[place], sign=out[place].sign * turn)
             out[place] = replace(one, zero=float(f"{self.value / scale_of(one):.6g}"), unsure=self.unsure)
         return out
 
 
-def find_zeros(case: Case, model: mujoco.MjModel) -> Draft:
+def find_zeros(case: Case) -> Draft:
     """The draft with the zeros of joints' columns with which the model explains clearly more.
 
     First what the model names (``ref``, keyframes, a body's place in the world) is tried, then of joints of which
@@ -476,35 +481,38 @@ def find_zeros(case: Case, model: mujoco.MjModel) -> Draft:
     now = case.outcome(readings)
     lost = {k: float(now.miss[case.dof(k)]) for k in joints}
     shown = sorted((k for k in joints if lost[k] > 0.3), key=lambda k: -lost[k])[:8]
-    zeros = [Zero(k, followers.get(k), v, 1, why) for k, joint in joints.items() for v, why in _named(model, joint)]
+    zeros = [Zero(k, followers.get(k), *one) for k, joint in joints.items() for one in _named(case.model, joint)]
     for k in shown:
-        grid = _grid(case, model, k)
-        zeros += [Zero(k, followers.get(k), v, 1) for v in grid]
+        grid = _grid(case, k)
+        zeros += [Zero(k, followers.get(k), v) for v in grid]
         if grid and k in followers:  # of the encoder alone, by which it is off the set-points
-            zeros.append(Zero(k, None, _apart(case, k, followers[k]), 1))
+            zeros.append(Zero(k, None, _apart(case, k, followers[k])))
     while True:
         here = case.score(readings)
-        tried = [zero._replace(sign=sign) for zero in zeros if zero.k in joints for sign in (1, -1)]
-        groups: dict[tuple[bool, int], list[Zero]] = {}
-        for zero in tried:
-            groups.setdefault((bool(zero.why), zero.sign * readings[zero.k].sign), []).append(zero)
+        groups: dict[tuple[bool, int, int | None], list[Zero]] = {}
+        for zero, sign in itertools.product((zero for zero in zeros if zero.k in joints), (1, -1)):
+            alone = zero.k if zero.follower is None and zero.k in followers else None
+            turn = sign * readings[zero.k].sign
+            if alone is None or turn == 1:  # alone a column keeps the direction of its set-points
+                groups.setdefault((bool(zero.why), turn, alone), []).append(zero._replace(sign=sign))
         best = [min(own, key=lambda one: case.score(one.put(readings))) for own in groups.values()]
-        best = [zero if zero.why else _refine(case, model, readings, zero) for zero in best]
+        best = [zero if zero.why else _refine(case, readings, zero) for zero in best]
         named = [zero for zero in best if zero.why and here - _cost(case, readings, zero) > DECIDED]
         best = sorted(named or best, key=lambda one: _cost(case, readings, one))
         if not best or abs(best[0].value) < 0.05 or here - _cost(case, readings, best[0]) <= DECIDED:
-            return case.draft.with_readings(readings)
+            break
         zero, put = best[0], best[0].put(readings)
-        then, k = case.outcome(put), zero.k
-        if not zero.why and then.miss[case.dof(k)] > min(_EXPLAINED, now.miss[case.dof(k)] / 1.5):
-            return case.draft.with_readings(readings)
+        then, dof = case.outcome(put), case.dof(zero.k)
+        if not zero.why and then.miss[dof] > min(_EXPLAINED, now.miss[dof] / 1.5):
+            break
         times = f"without it, {float((now.miss / then.miss).max()):.2g} times as much of the joints' forces is left"
-        for place in (k, *([] if zero.follower is None else [zero.follower])):
-            why = f"zero {put[place].zero:g}, {zero.why}: {times}"
-            alone = f"zero {put[place].zero:.3g}, which these logs alone tell: {times}"
-            put[place] = put[place].add_evidence(why) if zero.why else put[place].add_evidence(doubt=alone)
+        for place in zero.places:
+            named_zero = f"zero {put[place].zero:g}, {zero.why}: {times}"
+            found_zero = f"zero {put[place].zero:.3g}, which these logs alone tell: {times}"
+            put[place] = put[place].add_evidence(*(named_zero, "") if zero.why else ("", found_zero))
         readings, now = put, then
-        del joints[k]
+        del joints[zero.k]
+    return case.draft.with_readings(readings)
 
 
 def _cost(case: Case, readings: Readings, zero: Zero) -> float:
@@ -513,9 +521,9 @@ def _cost(case: Case, readings: Readings, zero: Zero) -> float:
     return case.score(zero.put(readings)) + DECIDED * unlikely
 
 
-def _refine(case: Case, model: mujoco.MjModel, readings: Readings, zero: Zero) -> Zero:
+def _refine(case: Case, readings: Readings, zero: Zero) -> Zero:
     """A zero of a grid looked for once more around itself, twice; unsure by two steps of the last grid."""
-    low, high = _range(model, case.positions[zero.k])
+    low, high = _range(case.model, case.positions[zero.k])
     for width in (0.1 * (high - low), 0.025 * (high - low)):
         steps = np.linspace(-width, width, 9).tolist()
         around = [zero._replace(value=zero.value + step, unsure=0.5 * width) for step in steps]
@@ -535,12 +543,12 @@ def _range(model: mujoco.MjModel, joint: Joint) -> tuple[float, float]:
     return joint.reach or (rest - float(reach), rest + float(reach))
 
 
-def _grid(case: Case, model: mujoco.MjModel, k: int) -> list[float]:
+def _grid(case: Case, k: int) -> list[float]:
     """Zeros that put the log's motion anywhere in the joint's range; none of a column whose zero is a share's."""
     joint, own = case.positions[k], case.series[:, case.channels[k][0]]
     if case.draft.readings[k].ends or (joint.hinge and np.ptp(own) < 0.2):  # which shows no change of gravity
         return []
-    values = float(np.median(own)) - np.linspace(*_range(model, joint), 11)
+    values = float(np.median(own)) - np.linspace(*_range(case.model, joint), 11)
     wraps = joint.hinge and joint.reach is None
     return ((values + np.pi) % (2 * np.pi) - np.pi if wraps else values).tolist()
 
@@ -559,9 +567,10 @@ def _named(model: mujoco.MjModel, joint: Joint) -> list[tuple[float, str]]:
     return [(value, why) for value, why in named.items() if abs(value) > 1e-6]
 
 
-def find_absolute_angles(search: Search, model: mujoco.MjModel) -> list[str]:
+def find_absolute_angles(search: Search) -> list[str]:
     """What is to be said of columns that the model explains far better with the angle of the link before taken off."""
     case, here, doubts = search.case, search.outcome.miss, []
+    model = case.model
     bodies = {int(model.joint(joint.name).bodyid[0]): k for k, joint in case.positions.items() if joint.hinge}
     for body, k in bodies.items():
         parent, dof = int(model.body_parentid[body]), case.dof(k)
@@ -570,11 +579,12 @@ def find_absolute_angles(search: Search, model: mujoco.MjModel) -> list[str]:
         if not parent or here[dof] < 0.1:
             continue
         before = bodies[parent]
-        there = Search(case.again(((case.channels[k][0], case.channels[before][0]),)), search.asked)
+        apart = ((case.channels[k][0], case.channels[before][0]),)
+        there = Search(replace(case, minus=apart, known={}), search.asked)
         pair = [q for q, one in enumerate(search.asked) if one.of_sign and {k, before} & {*one.readings}]
         there.add([search.best, *search.single_changes()])
-        for group in [*((q,) for q in pair), tuple(pair)]:
-            there.add([tuple(turned(a) if q in group else a for q, a in enumerate(there.best))])
+        for group in (*([q] for q in pair), pair):
+            there.add([_flip(there.best, group)])
         then = float(there.outcome.miss[dof])
         better = search.nats(search.best) - there.nats(there.best)
         if better > 2 * DECIDED and then < min(_EXPLAINED, here[dof] / 1.5):
@@ -617,11 +627,10 @@ def check_gyros(case: Case, gyros: Readings) -> dict[str, Reading]:
         best = words[int(np.argmin(left))]
         if left.min() > 0.4:
             text = f"it does not turn as what is measured does ({100 * left.min():.0f} % is left): how is it mounted?"
-            done = reading.add_evidence(doubt=text)
+            out[reading.match.target] = reading.add_evidence(doubt=text)
         elif reading.match.label.unit and best != reading.unit:
-            done = _with_named_unit(reading, best, "it turns as fast as what is measured")
+            out[reading.match.target] = _with_named_unit(reading, best, "it turns as fast as what is measured")
         else:
-            note = f"{best}: as fast as what is measured turns"
-            done = replace(reading, unit=best, notes=(note, *reading.notes))
-        out[reading.match.target] = done
+            notes = (f"{best}: as fast as what is measured turns", *reading.notes)
+            out[reading.match.target] = replace(reading, unit=best, notes=notes)
     return out

@@ -13,7 +13,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from sipe_bayes.calibration.column_names import Kind, pieces_of, read_vocabulary
-from sipe_bayes.calibration.init.cases import Source, case_of, gyros_of, rough_parameters, tried_part
+from sipe_bayes.calibration.init.cases import Scene, Source, gyros_of, rough_parameters, tried_part, with_forces
 from sipe_bayes.calibration.init.decisions import (
     Case,
     check_gyros,
@@ -24,7 +24,6 @@ from sipe_bayes.calibration.init.decisions import (
     search_answers,
 )
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Proposal, Reading
-from sipe_bayes.calibration.init.forces import with_forces
 from sipe_bayes.calibration.init.matching import Match, Matches, match_columns
 from sipe_bayes.calibration.init.oddities import find_oddities
 from sipe_bayes.calibration.init.parameters import FORCES, candidates, nameless, springs
@@ -100,7 +99,7 @@ def propose(
     )  # fmt: skip
     if tried_part(draft).measurements:
         with threadpool_limits(1):  # all matrices are small
-            draft = _decided(draft, model, machine, sources, folder, matches.forces, opened, tell)
+            draft = _decided(draft, Scene(model, machine, sources, folder, tell), matches.forces, opened)
     else:  # from which windows could start
         doubt = "no column measures a position, so nothing was simulated: units and signs are those of the names"
         rough = rough_parameters(model, machine, draft.readings)
@@ -128,17 +127,17 @@ def _is_felt(machine: Machine, matches: Matches) -> bool:
 
 def _fit_sensors(draft: Draft) -> Draft:
     """The draft with inertial sensors fitted, their biases free, and states free at every sample."""
-    sensors = [r for r in draft.measurements if r.match.target.startswith("sensor:")]
-    biases = []
-    for reading in sensors:
-        name = reading.match.target.removeprefix("sensor:")
-        largest = 1.0 if reading.unit in ("m/s^2", "g0") else 0.2  # m/s^2, rad/s
-        for axis in "xyz":
-            target = (f"sensor:{name}_{axis}.bias",)
-            biases.append(Proposal(f"{name}_bias_{axis}", target, -largest, largest, False, "constant error"))
-    measurements = tuple(replace(r, fit=True) if r in sensors else r for r in draft.measurements)
-    note, parameters = "an inertial unit tells the pose: see floating-base.md", (*draft.parameters, *biases)
-    return replace(draft, measurements=measurements, parameters=parameters, window=None, window_note=note)
+    measurements, parameters = list(draft.measurements), list(draft.parameters)
+    for k, reading in enumerate(measurements):
+        kind, _, name = reading.match.target.partition(":")
+        if kind == "sensor":
+            measurements[k] = replace(reading, fit=True)
+            most = 1.0 if reading.unit in ("m/s^2", "g0") else 0.2  # m/s^2, rad/s
+            for axis in "xyz":
+                target = (f"sensor:{name}_{axis}.bias",)
+                parameters.append(Proposal(f"{name}_bias_{axis}", target, -most, most, False, "constant error"))
+    draft = replace(draft, measurements=tuple(measurements), parameters=tuple(parameters))
+    return replace(draft, window=None, window_note="an inertial unit tells the pose: see floating-base.md")
 
 
 def _files(logs: Sequence[Path]) -> list[Path]:
@@ -240,49 +239,33 @@ def _split(
         lines = [begin, replace(begin, use="holdout", name=f"{kept[0].stem}-end", span=(cut, end))]
         sources = [Source(kept[0])]
     else:
-        train, stems = len(kept) - max(1, len(kept) // 5), [file.stem for file in kept]
-        unique = len({*stems}) == len(stems)
-        names = ["" if unique else f"{stem}-{k}" for k, stem in enumerate(stems)]
-        lines = [
-            LogLine(_relative(file, folder), "train" if k < train else "holdout", name)
-            for k, (file, name) in enumerate(zip(kept, names, strict=True))
-        ]
+        train, unique = len(kept) - max(1, len(kept) // 5), len({file.stem for file in kept}) == len(kept)
+        for k, file in enumerate(kept):
+            name = "" if unique else f"{file.stem}-{k}"
+            lines.append(LogLine(_relative(file, folder), "train" if k < train else "holdout", name))
         sources = [Source(file) for file in kept[:train]]
     return tuple(lines), [sources[i] for i in _spread(len(sources))], notes
 
 
-def _decided(
-    draft: Draft,
-    model: mujoco.MjModel,
-    machine: Machine,
-    sources: list[Source],
-    folder: Path,
-    forces: Sequence[Match],
-    opened: Opened,
-    tell: Tell,
-) -> Draft:
+def _decided(draft: Draft, scene: Scene, forces: Sequence[Match], opened: Opened) -> Draft:
     """Units, signs, zeros, delay, parameters and the window's length, by regressions of the logs."""
-    part, gyros = tried_part(draft), gyros_of(draft, model, machine)
-
-    def case(part: Draft) -> Case:
-        return case_of(part, model, machine, sources, folder, gyros, tell)
-
-    tell("units and signs")
-    search = search_answers(case(part))
-    against_world = find_absolute_angles(search, model)
-    decided, springs_act = decide(search), search.case.regression.springs
-    tell("zeros of joints")
-    placed = find_zeros(case(decided), model)
-    there = case(placed)
+    part, gyros = tried_part(draft), gyros_of(draft, scene.model, scene.machine)
+    scene.tell("units and signs")
+    search = search_answers(scene.case(part, gyros))
+    against_world = find_absolute_angles(search)
+    decided = decide(search)
+    scene.tell("zeros of joints")
+    placed = find_zeros(scene.case(decided, gyros))
+    there = scene.case(placed, gyros)
     if placed != decided and against_world:  # a zero may have made an angle look like one against the world
-        against_world = find_absolute_angles(search_answers(case(placed)), model)
+        against_world = find_absolute_angles(search_answers(scene.case(placed, gyros)))
     read, turned = check_named_units(there, placed.readings), check_gyros(there, gyros)
-    done, unlike = with_forces(placed.with_readings(read), forces, model, machine, sources, folder)
-    tell("delay and parameters")
-    last = case(done)
-    last.regression.springs = springs_act
-    chosen = _choose_parameters(last, model, sources, folder)
-    window, why = _window(machine, last.regression)
+    done, unlike = with_forces(placed.with_readings(read), forces, scene)
+    scene.tell("delay and parameters")
+    last = scene.case(done, gyros)
+    last.regression.springs = search.case.regression.springs
+    chosen = _choose_parameters(last, scene)
+    window, why = _window(scene.machine, last.regression)
     rest = tuple(turned.get(r.match.target, r) for r in draft.measurements if r not in part.measurements)
     odd = find_oddities(there, opened)
     return replace(
@@ -292,12 +275,12 @@ def _decided(
     )  # fmt: skip
 
 
-def _choose_parameters(case: Case, model: mujoco.MjModel, sources: Sequence[Source], folder: Path) -> Draft:
+def _choose_parameters(case: Case, scene: Scene) -> Draft:
     """The draft with the parameters that these logs tell apart, the delay, and only their notes and doubts.
 
     Bounds are of the size of the motion.
     """
-    draft, machine, regression = case.draft, case.machine, case.regression
+    draft, model, machine, regression = case.draft, case.model, case.machine, case.regression
     outcome, dt = regression.fit(regression.given), regression.logs[0].dt
     sizes = sizes_of(model, machine, regression, outcome)
     passed = np.concatenate([own[:: 1 + len(own) // 300] for own in regression.states])
@@ -305,15 +288,15 @@ def _choose_parameters(case: Case, model: mujoco.MjModel, sources: Sequence[Sour
     proposals = candidates(model, machine, draft.readings, sizes, sorted(touching))
     proposals, values = inform_bounds(model, proposals, regression, outcome)
     beside = springs(model, machine, draft.readings, sizes)
-    wide = case_of(replace(draft, parameters=(*proposals, *beside)), model, machine, sources, folder).regression
+    wide = scene.case(replace(draft, parameters=(*proposals, *beside))).regression
     proposals = [one for one in proposals if one.name in wide.environment.space.names]
     fit = fit_parameters(wide, outcome, values)
     actuators = [r.match.target.removeprefix("actuator:") for r in draft.commands]
     late, note = delay_of(actuators, outcome, regression.independent(outcome), regression.delays, dt)
     chosen, at = choose(model, proposals, fit, not _knows_force(draft.readings, proposals))
-    nothing = regression.known.any() and outcome.miss[regression.known].min() > 0.9
+    nothing = bool(regression.known.any()) and case.explains_nothing(outcome)
     for k, one in enumerate(chosen):
-        reason = one.left_out or "the model explains nothing of these logs" * bool(nothing)
+        reason = one.left_out or "the model explains nothing of these logs" * nothing
         reason = "" if one.targets[0].startswith("geom:") else reason  # forces without contacts tell nothing of these
         chosen[k] = (
             replace(one, left_out=reason) if reason else widen_bounds(model, replace(one, left_out=""), float(at[k]))

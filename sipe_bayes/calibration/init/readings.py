@@ -79,14 +79,6 @@ def _name_unit(reading: Reading, unit: str) -> Reading:
     return replace(reading, match=replace(reading.match, label=replace(reading.match.label, unit=unit)))
 
 
-def _add_note(reading: Reading, note: str) -> Reading:
-    return replace(reading, notes=(*reading.notes, note))
-
-
-def _add_doubt(reading: Reading, doubt: str, *instead: str) -> Reading:
-    return replace(reading, doubts=(*reading.doubts, doubt), instead=(*reading.instead, *instead))
-
-
 def _note_match(match: Match) -> tuple[str, ...]:
     how = "for the nearest name" if match.named else "by the order of names alone"
     return () if match.sure else (f"taken for {match.target} {how}",)
@@ -96,14 +88,15 @@ def _read_position(machine: Machine, match: Match, table: Table, turns: Mapping[
     reading = Reading(match, _choose_unit(match, _find_joint_unit(machine, match)), notes=_note_match(match))
     if turn := turns.get(match.column):
         unit = {360.0: "deg", 2 * np.pi: "rad", 1.0: "rev"}[turn]
-        reading = _add_note(reading, f"jumps by {turn:.5g} where it comes round: {unit}, jumps are taken out")
-        return replace(_name_unit(reading, unit), unit=unit, wraps=True)
+        note = f"jumps by {turn:.5g} where it comes round: {unit}, jumps are taken out"
+        return replace(_name_unit(reading, unit), unit=unit, wraps=True).add_evidence(note)
     counts = _find_counts(table[match.column], match.label) if reading.unit == "rad" and not match.label.unit else ()
     if counts:
         return replace(reading, scales=counts).read_as(counts[0])
     if white_share(table[match.column]) < 0.05:
-        note = "looks filtered: hardly any noise at its highest frequencies; its lag would count as a delay"
-        reading = _add_note(reading, note)
+        return reading.add_evidence(
+            "looks filtered: hardly any noise at its highest frequencies; its lag would count as a delay"
+        )
     return reading
 
 
@@ -156,16 +149,16 @@ def _use_velocity(reading: Reading, matches: Matches, table: Table, clock: Clock
     if slope.share < _FOLLOWS or not near:
         return reading
     unit, factor, *_ = near[0]
-    reading = _add_note(reading, f"{near[0]}: {partner.column!r} in {partner.label.unit} is its slope")
-    is_count = near[0] in reading.scales
-    return replace(reading if is_count else _name_unit(reading, unit), factor=factor, unit=unit, scales=())
+    read = reading if near[0] in reading.scales else _name_unit(reading, unit)
+    note = f"{near[0]}: {partner.column!r} in {partner.label.unit} is its slope"
+    return replace(read, factor=factor, unit=unit, scales=()).add_evidence(note)
 
 
 def _read_vector(match: Match, table: Table) -> Reading:
     """Poses and inertial sensors, whose units their sizes tell."""
     if match.quaternion and not match.label.axis:
         doubt = f"is the quaternion {match.quaternion} or xyzw? its columns do not say"
-        return _add_doubt(Reading(match, "1"), doubt, 'quaternion = "xyzw"')
+        return Reading(match, "1", doubts=(doubt,), instead=('quaternion = "xyzw"',))
     if match.quaternion:
         return Reading(match, "1", notes=(f"a quaternion in the order {match.quaternion}, by its axes",))
     size = float(np.nanmedian(np.linalg.norm([table[c] for c in match.columns], axis=0)))
@@ -206,11 +199,11 @@ def _read_command(actuator: Actuator, match: Match, matches: Matches, table: Tab
                 f"it looks like a set-point of {place.column!r} ({100 * share:.0f} % of its variance), but "
                 f"{actuator.name} takes {actuator.drive.value}; make it a <position> actuator, or name the torque"
             )
-            reading = _add_doubt(reading, doubt)
+            reading = reading.add_evidence("", doubt)
     others = [m.column for m in matches.rivals if m.target == match.target][:3]
     if others:
         doubt = f"{match.column!r} or {', '.join(map(repr, others))}? both may drive {actuator.name}"
-        reading = _add_doubt(reading, doubt, *(f'column = "{other}"' for other in others))
+        reading = reading.add_evidence("", doubt, *(f'column = "{other}"' for other in others))
     return reading
 
 
@@ -230,18 +223,19 @@ def _read_duty(match: Match, actuator: Actuator, table: Table, pulse: tuple[floa
     factor, zero = reading.factor, reading.zero
     if zero and (values == 0).any():
         armed = f"{match.column!r} is 0 at times, as before a controller is armed, which is read as {-zero * factor:g}"
-        reading = _add_doubt(reading, f"{armed}: begin the logs later")
+        reading = reading.add_evidence("", f"{armed}: begin the logs later")
     voltages = [n for n in table if read_name(n).kind == Kind.SUPPLY and np.isfinite(table[n]).any()]
     supplied = float(np.nanmedian(table[voltages[0]])) if voltages else 0.0
     volts = ("mV", 1e-3) if supplied > _MILLIVOLTS else ("V", 1.0)
     if voltages and (actuator.limits is None or max(np.abs(actuator.limits)) >= supplied * volts[1] / 2):
-        return replace(_add_note(reading, f"what arrives is it times {voltages[0]!r}"), supply=(voltages[0], volts[0]))
+        reading = replace(reading, supply=(voltages[0], volts[0]))
+        return reading.add_evidence(f"what arrives is it times {voltages[0]!r}")
     if actuator.full is not None:
-        reading = _add_note(reading, f"all of it is taken for {actuator.full:g}, where the model's ctrlrange ends")
-        return replace(reading, factor=float(f"{factor * actuator.full:.6g}"))
+        reading = replace(reading, factor=float(f"{factor * actuator.full:.6g}"))
+        return reading.add_evidence(f"all of it is taken for {actuator.full:g}, where the model's ctrlrange ends")
     if actuator.drive != Drive.VOLTAGE:
         note = "all of it is one unit of control: the model has no ctrlrange from zero or the same to both sides"
-        return _add_note(reading, note)
+        return reading.add_evidence(note)
     doubt = f"a share of which voltage? no column tells; multiply `factor` by the supply's volts for {actuator.name}"
     return replace(reading, doubts=(doubt,), instead=(f"factor = {12 * factor:.6g}  # at 12 V",))
 
@@ -275,24 +269,20 @@ def _turn_into_range(reading: Reading, actuator: Actuator, table: Table) -> Read
         return reading
     if lost < 1 - few and (values > noise).mean() > few:
         doubt = f"{100 * lost:.0f} % of it lie {text}: look at the range, and at where the command has its zero"
-        return _add_doubt(reading, doubt)
+        return reading.add_evidence("", doubt)
     turned = -values[values < 0]
     if reading.supply or np.mean((turned > (1 + _NEAR) * most) | (turned < (1 - _NEAR) * least)) < few:
         doubt = f"all of it lies {text}, and inside with the other sign, which is taken; check it"
-        return replace(_add_doubt(reading, doubt, "sign = 1"), sign=-1)
+        return replace(reading, sign=-1).add_evidence("", doubt, "sign = 1")
     doubt = f"all of it lies {text}, and with the other sign too: look at the range and at the unit"
-    return _add_doubt(reading, doubt, "sign = -1")
+    return reading.add_evidence("", doubt, "sign = -1")
 
 
 def with_velocities(measurements: Sequence[Reading], table: Table, clock: Clock) -> tuple[Reading, ...]:
     """Velocities in the unit and direction that the slopes of their positions ask for."""
-    places, out = {r.match.target: r for r in measurements}, []
-    for reading in measurements:
-        target = reading.match.target
-        place = places.get(target.removesuffix("velocity") + "position") if target.startswith("joint:") else None
-        moves = target.endswith(".velocity") and place is not None
-        out.append(_hold_against_slope(reading, place, table, clock) if moves and place else reading)
-    return tuple(out)
+    places = {r.match.target.removesuffix("position") + "velocity": r for r in measurements if r.joint}
+    pairs = [(reading, places.get(reading.match.target)) for reading in measurements]
+    return tuple(one if place is None else _hold_against_slope(one, place, table, clock) for one, place in pairs)
 
 
 def _hold_against_slope(reading: Reading, place: Reading, table: Table, clock: Clock) -> Reading:
@@ -302,23 +292,22 @@ def _hold_against_slope(reading: Reading, place: Reading, table: Table, clock: C
     if slope.share < _FOLLOWS:
         is_no_slope = f"it is not its slope ({100 * slope.share:.0f} % of the variance)"
         doubt = f"taken for the velocity of {own!r} by name, but {is_no_slope}; it only starts windows"
-        return _add_doubt(reading, doubt)
+        return reading.add_evidence("", doubt)
     wanted = slope.factor * place.sign * find_unit(place.unit).factor * place.factor / second / reading.factor
     words = unit_words(find_unit(reading.unit).dimension)
     word = min(words, key=lambda w: abs(np.log(abs(wanted) / find_unit(w).factor)))
     sign, near = 1 if wanted > 0 else -1, abs(wanted) / find_unit(word).factor
     times = f"the slope of {own!r} is {slope.factor:.4g} times it for each {clock.unit}"
-    reading = _add_note(replace(reading, unit=word, sign=sign), f"{'-' if sign < 0 else ''}{word}: {times}")
+    reading = replace(reading, unit=word, sign=sign).add_evidence(f"{'-' if sign < 0 else ''}{word}: {times}")
     if slope.lag > 1:
         late = 1e3 * slope.lag * clock.period * second
-        reading = _add_note(reading, f"late by {slope.lag:.1f} samples ({late:.2g} ms), as a filter makes it")
-    reading = _add_note(reading, "it starts windows and is not fitted: the position says the same")
+        reading = reading.add_evidence(f"late by {slope.lag:.1f} samples ({late:.2g} ms), as a filter makes it")
+    doubt = ""
     if abs(np.log(near)) > _NEAR:
-        other = "one of the two, or the clock, has another unit"
-        return _add_doubt(reading, f"{near:.3g} times the slope of {own!r} even in {word}: {other}")
-    if named and named != word and named in words:
-        return _add_doubt(reading, f"its name says {named}, but as the slope of {own!r} it is {word}")
-    return reading
+        doubt = f"{near:.3g} times the slope of {own!r} even in {word}: one of the two, or the clock, has another unit"
+    elif named and named != word and named in words:
+        doubt = f"its name says {named}, but as the slope of {own!r} it is {word}"
+    return reading.add_evidence("it starts windows and is not fitted: the position says the same", doubt)
 
 
 def _add_shares(
@@ -344,7 +333,7 @@ def _add_shares(
         for k in members if ends else ():
             reading = replace(out[k], shares=() if says else (share,), reach=joint.reach)
             if says:  # of which nothing else is asked
-                reading = _add_note(replace(_name_unit(reading, ""), scales=()), f"{share}, as its name says")
+                reading = replace(_name_unit(reading, ""), scales=()).add_evidence(f"{share}, as its name says")
             out[k] = reading.read_as(share) if likely else reading
     return out[: len(positions)], out[len(positions) :]
 

@@ -233,14 +233,13 @@ class Regression:
 
     def _turned(self, gyro: Gyro, rates: FloatArray) -> FloatArray:
         """What is left (F,) of a gyro's rates with each factor, up to .06 s late, and whatever its constant error."""
-        left, model = [], rates - rates.mean(0)
+        left, model, factors = [], rates - rates.mean(0), np.array(gyro.factors)[:, None, None]
         for late in range(int(0.06 / self.logs[0].dt) + 1):
             some = zip(gyro.rates, self.rows, self.widths, strict=True)
             own = [gaussian_filter1d(x, w, axis=0)[np.minimum(r + late, len(x) - 1)] for x, r, w in some]
-            seen = np.concatenate(own) - np.concatenate(own).mean(0)
-            sizes = [max(f * np.sqrt((seen**2).mean()), np.sqrt((model**2).mean()), 1e-12) for f in gyro.factors]
-            away = [np.sqrt(((f * seen - model) ** 2).mean()) for f in gyro.factors]
-            left.append(np.divide(away, sizes))
+            seen = factors * (np.concatenate(own) - np.concatenate(own).mean(0))
+            sizes = np.maximum(np.sqrt((seen**2).mean((1, 2))), np.sqrt((model**2).mean()) + 1e-12)
+            left.append(np.sqrt(((seen - model) ** 2).mean((1, 2))) / sizes)
         return np.clip(np.min(left, axis=0), BEST, WORST)
 
     def _design(self, motion: Motion, delay: int, dofs: IntArray, size: FloatArray) -> tuple[FloatArray, ...]:
@@ -325,8 +324,9 @@ class Regression:
         """Forces (D, R, A) of commands, with the feedback of servos."""
         model, out = self.simulator.model, np.zeros_like(commands)
         for k, (index, drive) in enumerate(zip(self.actuators, self.drives, strict=True)):
-            gain = _gain_of(model, index)
-            fixed = int(model.actuator_gaintype[index]) == int(mujoco.mjtGain.mjGAIN_FIXED)
+            kind, prm = int(model.actuator_gaintype[index]), model.actuator_gainprm[index]
+            motor, fixed = kind == int(mujoco.mjtGain.mjGAIN_DCMOTOR), kind == int(mujoco.mjtGain.mjGAIN_FIXED)
+            gain = float(prm[1] / max(prm[0], 1e-12) if motor else prm[0] or 1.0)  # before the gear
             rest, by_length, by_rate = model.actuator_biasprm[index, :3] if fixed else (0.0, -gain, -gain)
             out[..., k] = gain * commands[..., k]
             if int(model.actuator_dyntype[index]) == int(mujoco.mjtDyn.mjDYN_INTEGRATOR):  # begun anywhere
@@ -403,14 +403,6 @@ def _without_friction(model: mujoco.MjModel) -> mujoco.MjModel:
     out.tendon_damping[:], out.tendon_frictionloss[:] = 0.0, 0.0
     out.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     return out
-
-
-def _gain_of(model: mujoco.MjModel, index: int) -> float:
-    """Force for each unit of the command, before the gear."""
-    kind = int(model.actuator_gaintype[index])
-    if kind == int(mujoco.mjtGain.mjGAIN_DCMOTOR):
-        return float(model.actuator_gainprm[index, 1] / max(model.actuator_gainprm[index, 0], 1e-12))
-    return float(model.actuator_gainprm[index, 0]) or 1.0
 
 
 def _filtered(model: mujoco.MjModel, index: int, commands: FloatArray, dt: float) -> FloatArray:
@@ -529,11 +521,10 @@ def _period(logs: Sequence[Trajectory]) -> float:
 def _finer(delays: Sequence[int], costs: FloatArray) -> float:
     """Where a parabola through the best delay and its neighbours is least."""
     i = int(np.argmin(costs))
-    if 0 < i < len(delays) - 1:
-        curve = np.polyfit(np.array(delays[i - 1 : i + 2], float), costs[i - 1 : i + 2], 2)
-        if curve[0] > 0:
-            return float(np.clip(-curve[1] / (2 * curve[0]), delays[i - 1], delays[i + 1]))
-    return float(delays[i])
+    if not 0 < i < len(delays) - 1:
+        return float(delays[i])
+    bend, slope, _ = np.polyfit(delays[i - 1 : i + 2], costs[i - 1 : i + 2], 2)
+    return float(np.clip(-slope / (2 * bend), delays[i - 1], delays[i + 1])) if bend > 0 else float(delays[i])
 
 
 def _rated(model: mujoco.MjModel, columns: Sequence[int | None]) -> list[tuple[int, int]]:

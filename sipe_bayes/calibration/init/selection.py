@@ -329,10 +329,13 @@ def delay_of(
         return [], f"the later commands arrive the better, up to the {1e3 * dt * best:.3g} ms that were tried, {why}"
     if not best and len(may) == 1:
         return [], "commands arrive at once: a delay would not explain more of the joints' forces"
-    high, note = dt * max(2 * best, best + 3), f"commands arrive about {1e3 * dt * outcome.delay:.3g} ms late, "
-    note += f"{outcome.delay:.2g} samples: {costs[0]:.2g} nats more than without a delay"
     if not best or costs[0] < 2:  # one costs little, and one that is left out is in all others
         high = dt * delays[min(may[-1] + 1, len(delays) - 1)]
         note = f"commands may be up to {1e3 * dt * delays[may[-1]]:.3g} ms late: these logs hardly tell"
+    else:
+        near = slice(i := int(np.argmin(costs)) - 1, i + 3)
+        error = 1e3 * dt / np.sqrt(2 * max(float(np.polyfit(delays[near], costs[near], 2)[0]), 1e-9))
+        high, late = dt * max(2 * best, best + 3), f"{1e3 * dt * outcome.delay:.3g} ms late (standard error {error:.2g}"
+        note = f"commands arrive about {late} ms), {outcome.delay:.2g} samples: {costs[0]:.2g} nats more than with none"
     targets = tuple(f"actuator:{name}.delay" for name in actuators)  # none at all is what the model has
     return [Proposal("delay", targets, 0.0, rounded_up(high), False, note)], note

@@ -13,7 +13,7 @@ from sipe_bayes.calibration.column_names import read_name
 from sipe_bayes.calibration.config import Config, load_config
 from sipe_bayes.calibration.config_tables import Command, Measurement
 from sipe_bayes.calibration.gathered import no_rigid_bodies
-from sipe_bayes.calibration.init.cases import Source, case_of, rough_parameters, tried_part
+from sipe_bayes.calibration.init.cases import Scene, Source, rough_parameters, tried_part
 from sipe_bayes.calibration.init.decisions import DECIDED, Case, Search, decide, search_answers
 from sipe_bayes.calibration.init.draft import Draft, LogLine, Reading
 from sipe_bayes.calibration.init.matching import Match
@@ -71,7 +71,7 @@ def validate_config(path: Path) -> Validated:
     part = tried_part(draft)
     part = replace(part, parameters=rough_parameters(model, machine, draft.readings))
     sources = [Source(log.file, log.episodes[0] if log.episodes else None, log.span) for log in train]
-    case = case_of(part, model, machine, sources, folder)
+    case = Scene(model, machine, sources, folder).case(part)
     search = search_answers(case)
     better = decide(search)
     out = [f"parameters: {one.text}. {ADVICE[one.code]}" for one in bodies]

@@ -32,6 +32,8 @@ CRANE = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbod
   <geom size=".03" pos="0 0 -.6" mass="{bob}"/></body></body></worldbody>
   <actuator><motor name="drive" joint="rail"/></actuator></mujoco>"""
 HEIGHT = "guide_height_m"
+TIME = np.arange(0, 8, 0.008)
+TORQUE = np.round(0.6 * np.sin(4 * TIME) + 0.4 * np.sin(9.1 * TIME), 3)
 
 
 def flown(text: str, start: float, commands: FloatArray, dt: float) -> FloatArray:
@@ -83,12 +85,10 @@ def test_what_stays_above_the_floor_is_asked_for_no_contact(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("zero", [0.8, -1.1])
 def test_the_zero_of_an_encoder_is_asked_for_where_simulations_alone_tell_it(tmp_path: Path, zero: float) -> None:
-    time = np.arange(0, 8, 0.008)
-    torque = np.round(0.6 * np.sin(4 * time) + 0.4 * np.sin(9.1 * time), 3)
-    angle = flown(PENDULUM.format(damping=0.02, mass=0.5), 0.3, torque, 0.008) + zero
-    angle += np.random.default_rng(2).normal(0, 1e-3, len(time))
+    angle = flown(PENDULUM.format(damping=0.02, mass=0.5), 0.3, TORQUE, 0.008) + zero
+    angle += np.random.default_rng(2).normal(0, 1e-3, len(TIME))
     (tmp_path / "model.xml").write_text(PENDULUM.format(damping=0.03, mass=0.4))
-    table = pd.DataFrame({"time": time, "hinge_rad": angle, "motor_torque_Nm": torque})
+    table = pd.DataFrame({"time": TIME, "hinge_rad": angle, "motor_torque_Nm": TORQUE})
     table.round(5).to_csv(tmp_path / "log.csv", index=False)
     draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
     (reading,) = draft.measurements
@@ -124,11 +124,9 @@ def test_the_zero_of_what_hangs_from_a_cart_that_the_model_has_wrong(tmp_path: P
 
 
 def test_a_column_that_nothing_follows_is_named_before_a_fit(tmp_path: Path) -> None:
-    time = np.arange(0, 8, 0.008)
-    torque = np.round(0.6 * np.sin(4 * time) + 0.4 * np.sin(9.1 * time), 3)
-    angle = flown(PENDULUM.format(damping=0.02, mass=0.5), 0.3, torque, 0.008)
+    angle = flown(PENDULUM.format(damping=0.02, mass=0.5), 0.3, TORQUE, 0.008)
     (tmp_path / "model.xml").write_text(PENDULUM.format(damping=0.03, mass=0.4))
-    pd.DataFrame({"time": time, "hinge_rad": angle, "motor_torque_Nm": torque}).to_csv(tmp_path / "log.csv")
+    pd.DataFrame({"time": TIME, "hinge_rad": angle, "motor_torque_Nm": TORQUE}).to_csv(tmp_path / "log.csv")
     path = tmp_path / "calibrate.toml"
     path.write_text(toml_of(propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path), "sipe init"))
     assert not_followed(prepare(path, 1)) == ()
