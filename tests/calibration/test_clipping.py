@@ -71,6 +71,14 @@ def test_what_is_flat_while_the_other_moves_on_is_cut_off(name: str, rate: float
     assert sum(counts.values()) == counts[name]
 
 
+def test_a_set_point_of_steps_that_holds_its_largest_value_is_not_cut_off() -> None:
+    """The joint goes on turning there, so that nothing rests: a set-point of the speed."""
+    time, steps = np.arange(0, 24, 0.02), np.repeat(np.random.default_rng(0).uniform(-1, 1, 40), 30)
+    turned = Signal("q", time, np.cumsum(following(steps, 0.02)), False)
+    assert clipped_of([Signal("u", time, steps, True), turned])["u"] == 0
+    assert clipped_of([Signal("u", time, np.clip(np.sin(2.0 * time), -2, 0.7), True), turned])["u"] > 0.1 * len(time)
+
+
 def test_without_a_set_point_the_rest_of_the_machine_tells() -> None:
     time, _ = arm(3)
     flat = np.minimum(np.sin(2.0 * time), 0.7)

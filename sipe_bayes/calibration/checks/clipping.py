@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sipe_bayes.calibration.signals import likeness
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray
 from sipe_bayes.core.options import Options, option
 
 
@@ -67,6 +67,7 @@ def count_clipped(
     A quantised signal that rests or turns there also repeats itself; clipping cuts off a moving one. So a run
     counts only if two samples before or after it the signal is at least three quanta away, a quantum being
     its smallest step. Switched and constant signals have none, and a command that is 0 there rests: an idle rotor.
+    Nor has a command of steps, which holds two other values at least half as long.
 
     Args:
         values: without those that are missing.
@@ -78,12 +79,15 @@ def count_clipped(
         return 0
     low, high = float(values.min()), float(values.max())
     far = SATURATION.quanta * _quantum(values)
+    same = _runs(np.diff(values) == 0)
+    holds = sorted(stop - start + 1 for start, stop in same if values[start] not in (0.0, low, high))
+    usual = 2 * holds[-2] if command and len(holds) > 1 else 0
     return sum(
         stop - start
         for extreme in (low, high)
         if extreme or not command
         for start, stop in _stuck(values, extreme, far)
-        if not rests(start, stop)
+        if stop - start > usual and not rests(start, stop)
     )
 
 
@@ -95,13 +99,18 @@ def _quantum(values: FloatArray) -> float:
 
 
 def _stuck(values: FloatArray, extreme: float, far: float) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], values == extreme, [False]]).astype(np.int8)))
     away = np.concatenate([[0.0, 0.0], np.abs(values - extreme), [0.0, 0.0]])
     return [
-        (int(start), int(stop))
-        for start, stop in zip(edges[::2], edges[1::2], strict=True)
+        (start, stop)
+        for start, stop in _runs(values == extreme)
         if stop - start >= SATURATION.run and max(away[start], away[stop + 3]) >= far
     ]
+
+
+def _runs(true: BoolArray) -> list[tuple[int, int]]:
+    """Where what is true begins and ends."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], true, [False]]).astype(np.int8))).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 class _Rests:

@@ -24,15 +24,12 @@ _IN_TURNS = {"estimate", "input", "odrive", "turns"}  # words of columns that dr
 
 
 class Scale(NamedTuple):
-    """A unit word, and what a column is multiplied by beside it; or what it says at the ends of its joint's range.
-
-    zero: what a column of counts says in the middle of its turn, where it is at 0 there.
-    """
+    """What a column may be read in: a unit word and a factor beside it, or a share of its joint's range."""
 
     unit: str
     factor: float = 1.0
-    ends: tuple[float, float] | None = None
-    zero: float = 0.0
+    ends: tuple[float, float] | None = None  # what a share says at the ends of the range
+    zero: float = 0.0  # what a column of counts says in the middle of its turn, where it is at 0 there
 
     def __str__(self) -> str:
         if self.ends:
@@ -43,43 +40,24 @@ class Scale(NamedTuple):
 
 @dataclass(frozen=True)
 class Reading:
-    """How columns are read.
+    """How columns are read: the model's value is sign * factor * (number - zero) of the unit."""
 
-    Args:
-        match: the columns and what they are.
-        unit: unit word.
-        sign: 1 or -1.
-        factor: beside the unit.
-        zero: what the column says where the model has 0.
-        unsure: SI, by how much that may be wrong where simulations alone tell it.
-        wraps: whether jumps by a turn are taken out.
-        fit: False for what only starts windows.
-        scales: what it may be in place of units of its kind: counts.
-        shares: what it may be besides: shares of its joint's range.
-        reach: that range, rad or m.
-        ends: what the column says at the ends of it, where it is read so.
-        supply: column of the voltage that a duty is a share of, and its unit.
-        notes: the evidence, each a comment.
-        doubts: what could not be decided, each a comment and told.
-        instead: lines of TOML that are the alternative where something could not be decided.
-    """
-
-    match: Match
+    match: Match  # the columns and what they are
     unit: str
     sign: int = 1
     factor: float = 1.0
     zero: float = 0.0
-    unsure: float = 0.0
-    wraps: bool = False
-    fit: bool = True
-    scales: tuple[Scale, ...] = ()
-    shares: tuple[Scale, ...] = ()
-    reach: tuple[float, float] | None = None
-    ends: tuple[float, float] | None = None
-    supply: tuple[str, str] | None = None
-    notes: tuple[str, ...] = ()
-    doubts: tuple[str, ...] = ()
-    instead: tuple[str, ...] = ()
+    unsure: float = 0.0  # SI, by how much the zero may be wrong where simulations alone tell it
+    wraps: bool = False  # whether jumps by a turn are taken out
+    fit: bool = True  # False for what only starts segments
+    scales: tuple[Scale, ...] = ()  # what it may be in place of units of its kind: counts
+    shares: tuple[Scale, ...] = ()  # what it may be besides: shares of its joint's range
+    reach: tuple[float, float] | None = None  # that range, rad or m
+    ends: tuple[float, float] | None = None  # what the column says at the ends of it, where it is read so
+    supply: tuple[str, str] | None = None  # column of the voltage that a duty is a share of, and its unit
+    notes: tuple[str, ...] = ()  # the evidence, each a comment
+    doubts: tuple[str, ...] = ()  # what could not be decided, each a comment and told
+    instead: tuple[str, ...] = ()  # lines of TOML that are the alternative where something could not be decided
 
     @property
     def joint(self) -> str:
@@ -152,20 +130,16 @@ class Reading:
 
 @dataclass(frozen=True)
 class Proposal:
-    """A parameter that may be free.
-
-    left_out says why it stands in a comment only. expected, SI: what the logs say of a size that may be anything, which
-    then has a log scale and a wide prior.
-    """
+    """A parameter that may be free."""
 
     name: str
     targets: tuple[str, ...]
     low: float
     high: float
-    relative: bool
+    relative: bool  # whether bounds are factors of the nominal value
     note: str
-    left_out: str = ""
-    expected: float | None = None
+    left_out: str = ""  # why it stands in a comment only
+    expected: float | None = None  # SI, what the logs say of a size that may be anything: log scale and wide prior
 
     def row(self) -> Row:
         """Its table in the configuration."""
@@ -196,45 +170,25 @@ class LogLine:
 
 @dataclass(frozen=True)
 class Draft:
-    """A configuration with its evidence.
+    """A configuration with its evidence."""
 
-    Args:
-        model: the MJCF, relative to the configuration.
-        clock: the log's clock.
-        episode: the column that numbers episodes.
-        commands: columns that drive actuators.
-        measurements: columns that measure.
-        logs: that train, and that are held out.
-        window: s, or "log"; None for states that are free in place of windows.
-        window_note: why.
-        parameters: those that are left out among them.
-        doubts: what could not be decided, beside what readings say.
-        notes: of the whole.
-        unused: columns that are none of the model's.
-        delay: of the commands, in samples.
-        seconds: that a calibration may take.
-        tied: columns of positions, each with that of the set-point that it follows.
-        together: columns that may be flipped together, in groups.
-        names: of columns without a header.
-    """
-
-    model: str
+    model: str  # the MJCF, relative to the configuration
     clock: Clock
-    episode: str | None
+    episode: str | None  # the column that numbers episodes
     commands: tuple[Reading, ...]
     measurements: tuple[Reading, ...]
     logs: tuple[LogLine, ...]
-    window: float | str | None
+    window: float | str | None  # s, or "log"; None for states that are free in place of segments
     window_note: str = ""
-    parameters: tuple[Proposal, ...] = ()
-    doubts: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-    unused: tuple[str, ...] = ()
-    delay: float = 0.0
-    seconds: float = 0.0
-    together: tuple[tuple[str, ...], ...] = ()
-    tied: tuple[tuple[str, str], ...] = ()
-    names: tuple[str, ...] = ()
+    parameters: tuple[Proposal, ...] = ()  # those that are left out among them
+    doubts: tuple[str, ...] = ()  # what could not be decided, beside what readings say
+    notes: tuple[str, ...] = ()  # of the whole
+    unused: tuple[str, ...] = ()  # columns that are none of the model's
+    delay: float = 0.0  # of the commands, in samples
+    seconds: float = 0.0  # that a calibration may take
+    together: tuple[tuple[str, ...], ...] = ()  # columns that may be flipped together, in groups
+    tied: tuple[tuple[str, str], ...] = ()  # columns of positions, each with that of the set-point that it follows
+    names: tuple[str, ...] = ()  # of columns without a header
 
     @property
     def readings(self) -> tuple[Reading, ...]:
@@ -282,15 +236,10 @@ Answer = Scale | int
 
 @dataclass(frozen=True)
 class Question:
-    """What is open: the unit of some readings, or the sign of one.
+    """What is open: the unit of some readings, or the sign of one."""
 
-    Args:
-        readings: places in ``Draft.readings``.
-        answers: scales or signs, the likeliest first: what names say, or a configuration that is checked.
-    """
-
-    readings: tuple[int, ...]
-    answers: tuple[Answer, ...]
+    readings: tuple[int, ...]  # places in ``Draft.readings``
+    answers: tuple[Answer, ...]  # scales or signs, first what names or a configuration say
 
     @property
     def of_sign(self) -> bool:

@@ -24,19 +24,15 @@ def find_oddities(case: Case, opened: Opened) -> list[str]:
 def _limits(case: Case, _: Opened) -> Iterator[str]:
     """Joints that the model stops, and the machine does not."""
     for k, joint in case.positions.items():
-        if joint.reach is None:
-            continue
-        values, (low, high) = case.series[:, case.channels[k][0]], joint.reach
-        room = 0.005 * (high - low)
-        share = float(np.mean((values < low + room) | (values > high - room)))
+        values, (low, high) = case.series[:, case.channels[k][0]], joint.reach or (-np.inf, np.inf)
+        share, least, most = _beyond(values, low, high, -0.005), values.min(), values.max()
         if share < 0.02:
             continue
-        text = (
-            f"{case.draft.readings[k].match.column!r}: {100 * share:.0f} % of the samples are at or beyond the range "
-        )
-        text, turn = f"{text}of {joint.name}, {low:.3g} to {high:.3g}", 180 / np.pi
-        beyond = max(low - values.min(), values.max() - high) > high - low
-        if joint.hinge and beyond and low * turn <= values.min() and values.max() <= high * turn:
+        name, turn = case.draft.readings[k].match.column, 180 / np.pi
+        text = f"{name!r}: {100 * share:.0f} % of the samples are at or beyond the range of {joint.name}"
+        text += f", {low:.3g} to {high:.3g}"
+        far = max(low - least, most - high) > high - low
+        if joint.hinge and far and low * turn <= least and most <= high * turn:
             yield (
                 f"{text} rad: look at the column's unit; or the model's angles are radians that are read as degrees, "
                 'which <compiler angle="radian"/> mends'
@@ -45,38 +41,50 @@ def _limits(case: Case, _: Opened) -> Iterator[str]:
             yield f"{text}: widen the range, or look at unit and zero"
 
 
-def _set_points(case: Case, _: Opened) -> Iterator[str]:
-    """Set-points that a ctrlrange cuts off."""
+def _beyond(values: FloatArray, low: float, high: float, room: float = 0.0) -> float:
+    """The share of values (n,) that lie beyond a range that is wider by ``room`` of it at both ends."""
+    room = room * (high - low) if np.isfinite(high - low) else 0.0
+    return float(np.mean((values < low - room) | (values > high + room)))
+
+
+def _cut_off(case: Case, _: Opened) -> Iterator[str]:
+    """Set-points that a ctrlrange cuts off, and other commands most of which it does."""
     model = case.regression.simulator.model
     for k, command in enumerate(case.commands):
-        if command is None or case.drive(k) not in SERVOS:
+        if command is None or not model.actuator_ctrllimited[index := case.regression.actuators[command]]:
             continue
-        index = case.regression.actuators[command]
         low, high = model.actuator_ctrlrange[index].tolist()
         values = np.concatenate([log.actions[:, command] for log in case.regression.logs])
-        share = float(np.mean((values < low) | (values > high)))
-        if model.actuator_ctrllimited[index] and share > 0.01:
+        name, actuator = case.draft.readings[k].match.column, model.actuator(index).name
+        if case.drive(k) not in SERVOS:
+            share = _beyond(values, low, high, 0.05)
+            if share > 0.5:
+                yield (
+                    f"commands, column {name!r}: {100 * share:.0f} % of it lies outside of the ctrlrange "
+                    f"{[low, high]} of actuator:{actuator}, which cuts it off; look at its factor, zero, supply"
+                )
+        elif (share := _beyond(values, low, high)) > 0.01:
             yield (
-                f"{case.draft.readings[k].match.column!r}: {100 * share:.0f} % of the set-points lie beyond the range "
-                f"{low:.3g} to {high:.3g} of {model.actuator(index).name}, which cuts them off: widen it, or look at "
-                "the unit"
+                f"{name!r}: {100 * share:.0f} % of the set-points lie beyond the range {low:.3g} to {high:.3g} of "
+                f"{actuator}, which cuts them off: widen it, or look at the unit"
             )
 
 
 def _drive_off(case: Case, _: Opened) -> Iterator[str]:
     """Parts of logs in which a position does not follow its set-point, though it does elsewhere."""
-    for k in case.ties:
-        place = case.ties[k][0]
+    for k, (place, _times) in case.ties.items():
         for log in case.regression.logs:
             wanted, seen = log.actions[:, case.commands[k]], log.observations[:-1, case.channels[place][0]]
             edges = pairwise(np.linspace(0, len(wanted), 11).astype(int).tolist())
             parts = [slice(a, b) for a, b in edges if (b - a) * log.dt > 0.3]
-            moves = [wanted[p].std() > 0.3 * wanted.std() > 0 for p in parts]
-            alike = [_alike(wanted[p], seen[p]) for p in parts]
             away = [float(np.sqrt(np.mean((wanted[p] - seen[p]) ** 2))) for p in parts]
-            rows = list(zip(parts, moves, alike, [x > 3 * np.median(away) for x in away], strict=True))
-            off = [part for part, move, like, far in rows if move and far and like < 0.2]
-            if off and sum(move and like > 0.7 for _, move, like, _ in rows) > 1:
+            alike = [
+                (part, _alike(wanted[part], seen[part]), far > 3 * np.median(away))
+                for part, far in zip(parts, away, strict=True)
+                if wanted[part].std() > 0.3 * wanted.std() > 0  # the set-point moves
+            ]
+            off = [part for part, like, far in alike if far and like < 0.2]
+            if off and sum(like > 0.7 for _, like, _ in alike) > 1:
                 yield (
                     f"{case.draft.readings[place].match.column!r} is not at its set-point from "
                     f"{off[0].start * log.dt:.3g} to {off[-1].stop * log.dt:.3g} s of {log.name!r}: if the drive was "
@@ -98,8 +106,10 @@ def _enabled(case: Case, opened: Opened) -> Iterator[str]:
         words = {*read_name(leaf(column)).words, *leaf(column).lower().replace("_", " ").split()}
         if column not in used and len(known) == 2 and any(w.startswith(("enab", "torque_en", "power")) for w in words):
             share = 100 * float(np.mean(values == known[0]))
-            when = "where the drive is off then, cut these parts out (`span`)"
-            yield f"{column!r} is {known[0]:g} in {share:.0f} % of the samples: {when}"
+            yield (
+                f"{column!r} is {known[0]:g} in {share:.0f} % of the samples: where the drive is off then, cut these "
+                "parts out (`span`)"
+            )
 
 
 def _unsigned(case: Case, opened: Opened) -> Iterator[str]:
@@ -137,13 +147,13 @@ def _steps(case: Case, _: Opened) -> Iterator[str]:
     data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, inertia)
-    gains, fastest, told = case.outcome(case.draft.readings).gains, 0.0, 0.0
-    for gain, index, drive in zip(gains, regression.actuators, regression.drives, strict=True):
-        if drive == Drive.POSITION and int(model.actuator_trntype[index]) == int(mujoco.mjtTrn.mjTRN_JOINT):
-            dof = model.jnt_dofadr[model.actuator_trnid[index, 0]]
-            stiffness = float(model.actuator_gainprm[index, 0] * model.actuator_gear[index, 0] ** 2)
-            rate = float(np.sqrt(max(stiffness, 0.0) / inertia[dof, dof]))
-            fastest, told = max(fastest, rate), max(told, rate * float(np.sqrt(np.clip(gain, 0, 1))))
+    at_joint = model.actuator_trntype[regression.actuators] == int(mujoco.mjtTrn.mjTRN_JOINT)
+    servos = at_joint & np.array([drive == Drive.POSITION for drive in regression.drives], bool)
+    index, gains = np.array(regression.actuators, int)[servos], case.outcome(case.draft.readings).gains[servos]
+    carried = np.diag(inertia)[model.jnt_dofadr[model.actuator_trnid[index, 0]]]
+    stiffness = model.actuator_gainprm[index, 0] * model.actuator_gear[index, 0] ** 2
+    rates = np.sqrt(np.maximum(stiffness, 0.0) / carried)
+    fastest, told = (float(own.max(initial=0.0)) for own in (rates, rates * np.sqrt(np.clip(gains, 0, 1))))
     if fastest * model.opt.timestep > 0.7:  # rad of a servo's own oscillation
         yield (
             f"the physics step of {model.opt.timestep:g} s is too long for the gains of the servos: write "
@@ -181,4 +191,4 @@ def _contacts(case: Case, _: Opened) -> Iterator[str]:
             )
 
 
-_ODDITIES = (_limits, _set_points, _drive_off, _enabled, _unsigned, _jumps, _steps, _inertias, _contacts)
+_ODDITIES = (_limits, _cut_off, _drive_off, _enabled, _unsigned, _jumps, _steps, _inertias, _contacts)

@@ -81,11 +81,11 @@ SLIPPERY = 0.02
 def propose_kinds(
     model: mujoco.MjModel, owner: str, of: Collection[str], sizes: Mapping[str, float] | None = None, more: str = ""
 ) -> list[Proposal]:
-    """The kinds of parameters that apply to an owner, but for those that its model can not have smaller.
+    """The kinds of parameters that apply to an owner, ``joint:NAME``, but for those that it can not have smaller.
 
     Args:
         model: as given.
-        owner: as in targets: ``joint:NAME``.
+        owner: as in targets.
         of: where kinds apply that are asked for.
         sizes: of the motion, by field.
         more: what is said besides.
@@ -95,14 +95,14 @@ def propose_kinds(
         fields = kind.fields.split()
         targets, size = tuple(f"{owner}.{field}" for field in fields), (sizes or {}).get(fields[0], 0.0)
         nominal, factor = bind(model, targets[0]).value, kind.rule == "factor"
-        bounds = {
-            "factor": (kind.low, kind.high),
-            "size": (0.0, rounded_up(max(4 * nominal, kind.high * size, 1e-12))),
-            "about": tuple(float(f"{nominal + x:.4g}") for x in (-kind.high * size, kind.high * size)),
-        }[kind.rule]
+        low, high = kind.low, kind.high
+        if kind.rule == "size":
+            low, high = 0.0, rounded_up(max(4 * nominal, kind.high * size, 1e-12))
+        elif kind.rule == "about":
+            low, high = (float(f"{nominal + x:.4g}") for x in (-kind.high * size, kind.high * size))
         note = f"{kind.what}{more}, {nominal:.4g} in the model"
-        one = Proposal(f"{word}_{kind.name}", targets, bounds[0], bounds[1], factor, note)
-        one = replace(one, low=max(one.low, least_of(model, one))) if factor else one
+        one = Proposal(f"{word}_{kind.name}", targets, low, high, factor, note)
+        one = replace(one, low=max(low, least_of(model, one))) if factor else one
         out += [one] if not factor or one.low < 1 else []
     return out
 
@@ -127,16 +127,15 @@ def candidates(
     flown = {_thrust_at(model, a) for a, _ in driven} & {*bodies}
     carrying = bases(model) - flown if driven and not attached else ()  # what is attached would stand for their inertia
     gains = [(a, p) for a, r in driven for p in propose_kinds(model, f"actuator:{a.name}", _classes(model, a, r))]
-    # a gain of the velocity alone does as damping does; that of a speed servo is its set-point's, too
-    fed_back = {
-        a.joint for a, gain in gains if len(gain.targets) == 1 and gain.targets[0].endswith((".kv", ".bias_velocity"))
-    }
+    # a gain of the velocity alone moves a joint as damping does; that of a speed servo is its set-point's, too
+    fed_back = [a.joint for a, p in gains if len(p.targets) == 1 and p.targets[0].endswith((".kv", ".bias_velocity"))]
+    felt = {r.joint for r in readings if r.match.target.endswith(".force")}  # which tells the two apart
     rotors = {actuator.joint for actuator in machine.actuators}
     of_joints = _of_tendons(model, [a for a, _ in driven], sizes) if joints else []
     for joint in (*(j for j in joints if not j.base), *passive):
-        of = ["rubbing", "sprung", *["damped"] * (joint not in fed_back)]  # of which a damping is the same
-        of += ["geared"] * (joint in joints or joint in rotors)
-        of_joints += _of_joint(model, f"joint:{joint.name}", of, sizes)
+        damped, geared = joint not in fed_back or joint.name in felt, joint in joints or joint in rotors
+        of = ["rubbing", "sprung", *["damped"] * damped, *["geared"] * geared]
+        of_joints += propose_of_joint(model, f"joint:{joint.name}", of, sizes)
     proposed = [
         *_sharing_rotors(model, gains), *masses, *(p for body in flown if not attached for p in _of_base(model, body)),
         *of_joints, *attached, *_zeros(readings), *contacts(model, {*bodies, *touching}),
@@ -150,7 +149,7 @@ def springs(model: mujoco.MjModel, machine: Machine, readings: Sequence[Reading]
     joints, passive = _moving(model, machine, [r for r in readings if r.match.target.endswith(".position")])
     held = {a.joint for a in machine.actuators if a.drive == Drive.POSITION}  # a spring shows as the gain does
     some = [j for j in (*joints, *passive) if not j.base and j not in held and not model.joint(j.name).stiffness[0]]
-    return [p for joint in some for p in _of_joint(model, f"joint:{joint.name}", ["soft"], sizes, joint.hinge)]
+    return [p for joint in some for p in propose_of_joint(model, f"joint:{joint.name}", ["soft"], sizes, joint.hinge)]
 
 
 def _moving(model: mujoco.MjModel, machine: Machine, readings: Sequence[Reading]) -> tuple[list[Joint], list[Joint]]:
@@ -188,12 +187,14 @@ def _sharing_rotors(model: mujoco.MjModel, gains: Sequence[tuple[Actuator, Propo
     for actuator, gain in gains:
         body = _thrust_at(model, actuator) if gain.targets[0].endswith(".gain") else 0
         groups.setdefault((body, gain.note if body else gain.name), []).append(gain)
-    shared = [own for (body, _), own in groups.items() if body and len(own) > 1]
-    every = [
-        replace(own[0], name=f"rotors_gain_{k}" if k else "rotors_gain", targets=tuple(p.targets[0] for p in own))
-        for k, own in enumerate(shared)
-    ]
-    return [*every, *(gain for own in groups.values() if own not in shared for gain in own)]
+    shared, single = list[Proposal](), list[Proposal]()
+    for (body, _), own in groups.items():
+        if body and len(own) > 1:
+            name = f"rotors_gain_{len(shared)}" if shared else "rotors_gain"
+            shared.append(replace(own[0], name=name, targets=tuple(p.targets[0] for p in own)))
+        else:
+            single += own
+    return [*shared, *single]
 
 
 def _thrust_at(model: mujoco.MjModel, actuator: Actuator) -> int:
@@ -222,7 +223,7 @@ def _of_base(model: mujoco.MjModel, body: int) -> list[Proposal]:
     return propose_kinds(model, f"body:{model.body(body).name}", ["base"], {f"com_{x}": size for x in "xyz"})
 
 
-def _of_joint(
+def propose_of_joint(
     model: mujoco.MjModel, owner: str, of: Collection[str], sizes: Sizes, hinge: bool = True
 ) -> list[Proposal]:
     """What resists the motion of a joint or tendon, up to sizes of the motion; its spring where it has one."""
@@ -247,7 +248,7 @@ def _of_tendons(model: mujoco.MjModel, driven: Sequence[Actuator], sizes: Sizes)
             by_joints = int(model.wrap_type[first]) == int(mujoco.mjtWrap.mjWRAP_JOINT)
             coupling = tendon in pulled and not (by_joints and int(model.tendon_num[tendon]) == 1)
             of = [w for f, w in RESISTANCE.items() if coupling or getattr(model, f"tendon_{f}")[tendon] > 0]
-            out += _of_joint(model, owner, [*of, "sprung"], sizes)
+            out += propose_of_joint(model, owner, [*of, "sprung"], sizes)
     return out
 
 

@@ -46,6 +46,7 @@ from sipe_bayes.calibration.readers.many import episodes_of, matching
 from sipe_bayes.calibration.readers.numbered import starred
 from sipe_bayes.calibration.readers.tables import READERS, read_table
 from sipe_bayes.core.telling import Tell, silent
+from sipe_bayes.core.units import find_unit
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 from sipe_bayes.envs.foreign.urdf import notes_of
 from sipe_bayes.envs.internal.closed_chains import dependent_joints
@@ -107,15 +108,20 @@ def propose(
     draft = replace(draft, measurements=with_velocities(draft.measurements, table, opened.clock))
     draft = _fit_sensors(draft) if felt else draft
     count = sum(max(1, len(log.episodes)) for log in draft.logs if log.use == "train")
-    return replace(draft, seconds=_expected(model, opened.seconds * count, len(draft.free)))
+    dt = opened.clock.period * find_unit(opened.clock.unit).factor
+    return replace(draft, seconds=_expected(model, opened.seconds * count, dt, len(draft.free)))
 
 
-def _expected(model: mujoco.MjModel, seconds: float, parameters: int) -> float:
-    """How long a calibration may take: some rounds of one rollout for each parameter, at the pace of a few steps."""
+def _expected(model: mujoco.MjModel, seconds: float, dt: float, parameters: int) -> float:
+    """How long a calibration may take: 150 runs of the logs, and 10 for each parameter and number of a start.
+
+    Each costs its physics steps, at the pace of a few, and 20 us for each of its samples of ``dt`` s.
+    """
     data, begun = mujoco.MjData(model), time.perf_counter()
     mujoco.mj_step(model, data, 500)
     step = (time.perf_counter() - begun) / 500
-    return 5.0 + 8 * (parameters + 2) * seconds / model.opt.timestep * step / (os.cpu_count() or 1)
+    runs = 150 + 10 * (parameters + 2 * model.nv)
+    return 10.0 + runs * seconds * (step / model.opt.timestep + 2e-5 / dt) / (os.cpu_count() or 1)
 
 
 def _is_felt(machine: Machine, matches: Matches) -> bool:

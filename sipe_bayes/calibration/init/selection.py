@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 import scipy.optimize
+from scipy.ndimage import gaussian_filter1d
 
 from sipe_bayes.calibration.column_names import pieces_of, read_vocabulary
 from sipe_bayes.calibration.init.draft import Proposal, rounded_up
-from sipe_bayes.calibration.init.parameters import least_of
+from sipe_bayes.calibration.init.parameters import RESISTANCE, least_of, propose_of_joint
 from sipe_bayes.calibration.init.regression import Outcome, Regression, turning_of
 from sipe_bayes.calibration.machine import Machine, Sizes
 from sipe_bayes.core.arrays import FloatArray
@@ -26,28 +29,16 @@ SHARED = ("armature", "damping", "frictionloss", "stiffness", "lag", "bias_veloc
 """What parts that are alike share first: what logs tell least of."""
 
 
-@dataclass(frozen=True)
-class Fit:
-    """Values of parameters that explain most.
+class Fit(NamedTuple):
+    """Values of parameters that explain most."""
 
-    Args:
-        theta: (N,) in the cube.
-        nominal: (N,) of the model, in the cube.
-        jacobian: (R, N) of the forces that are left, in units of their size.
-    """
-
-    theta: FloatArray
-    nominal: FloatArray
-    jacobian: FloatArray
-
-    @property
-    def effects(self) -> FloatArray:
-        """What each parameter changes (R, N) over its range, in units of the noise; residuals are correlated."""
-        return self.jacobian / np.sqrt(max(1.0, len(self.jacobian) / 400.0))
+    theta: FloatArray  # (N,) in the cube
+    nominal: FloatArray  # (N,) of the model, in the cube
+    jacobian: FloatArray  # (R, N) what each parameter changes over its range, in units of the noise
 
 
 def fit_parameters(regression: Regression, outcome: Outcome, values: dict[str, float]) -> Fit:
-    """One Gauss-Newton step of the forces, of logs as the configuration reads them.
+    """One Gauss-Newton step of the forces and measured efforts, of logs as the configuration reads them.
 
     Args:
         regression: whose environment has the parameters.
@@ -62,20 +53,42 @@ def fit_parameters(regression: Regression, outcome: Outcome, values: dict[str, f
     dofs = np.flatnonzero(regression.known & (outcome.size > 0))
     if not len(dofs):
         return Fit(start, nominal, np.zeros((1, len(start))))
-    base = _left(regression, start, late)[:, dofs]
-    size = (outcome.left[:, dofs] * outcome.size[dofs]).std(0) + 1e-12
-    steps = np.where(start > 0.98, -0.02, 0.02)
-    slopes = [(_left(regression, start + row, late)[:, dofs] - base) / size / row.sum() for row in np.diag(steps)]
-    jacobian = np.stack([slope.ravel() for slope in slopes], axis=1)
+    at, efforts = _efforts(regression)
+
+    def left(theta: FloatArray) -> FloatArray:
+        lacking, driven = _forces(regression, theta, late)
+        return np.concatenate([lacking[:, dofs], driven[:, at] - efforts], axis=1)
+
+    base, steps = left(start), np.where(start > 0.98, -0.02, 0.02)
+    slopes = np.stack([(left(start + row) - base) / row.sum() for row in np.diag(steps)], axis=-1)
+    size = (outcome.left[:, dofs] * outcome.size[dofs]).std(0)
+    size = np.append(size, [_unexplained(base[:, k], slopes[:, k]) for k in range(len(dofs), base.shape[1])]) + 1e-12
+    jacobian = (slopes / size[:, None]).reshape(-1, len(start))
     share = np.sqrt(min(1.0, regression.independent(outcome) / len(base)))  # what is left is correlated
     design = np.concatenate([share * jacobian, np.eye(len(start)) / 0.4])  # with a prior of that sd
     wanted = np.concatenate([-share * (base / size).ravel(), np.zeros(len(start))])
     step = scipy.optimize.lsq_linear(design, wanted, (-start - 1e-9, 1 - start + 1e-9), method="bvls").x
-    return Fit(np.clip(start + step, 0.0, 1.0), nominal, jacobian)
+    independent = np.sqrt(max(1.0, len(base) * len(dofs) / 400.0))
+    return Fit(np.clip(start + step, 0.0, 1.0), nominal, jacobian / independent)
 
 
-def _left(regression: Regression, theta: FloatArray, late: int) -> FloatArray:
-    """Forces (R, V) that the model asks for beyond those that its actuators and its friction give."""
+def _efforts(regression: Regression) -> tuple[list[int], FloatArray]:
+    """Degrees of freedom (C,) at which the logs measure what actuators apply, and these forces (R, C), smoothed."""
+    targets = [re.fullmatch(r"joint:(.+)\.force", channel.target) for channel in regression.environment.measurements]
+    columns = [k for k, match in enumerate(targets) if match]
+    dofs = [int(regression.simulator.model.joint(match[1]).dofadr[0]) for match in targets if match]
+    logs = zip(regression.logs, regression.widths, regression.rows, strict=True)
+    smooth = [gaussian_filter1d(log.observations[:, columns], width, axis=0)[rows] for log, width, rows in logs]
+    return dofs, np.concatenate(smooth)
+
+
+def _unexplained(values: FloatArray, slopes: FloatArray) -> float:
+    """The spread of what slopes (R, N) leave of values (R,)."""
+    return float((values - slopes @ np.linalg.lstsq(slopes, values, rcond=None)[0]).std())
+
+
+def _forces(regression: Regression, theta: FloatArray, late: int) -> tuple[FloatArray, FloatArray]:
+    """Forces (R, V) that the model asks for beyond those of its actuators and its friction, and those of actuators."""
     environment, model = regression.simulator.environment, copy(regression.simulator.model)
     values = environment.space.values(theta)
     environment.write(model, values)
@@ -87,7 +100,8 @@ def _left(regression: Regression, theta: FloatArray, late: int) -> FloatArray:
         motion = regression.motion(replace(regression.given, zeros=tuple(bias.tolist())))
     (commands,) = regression.commands(regression.given, [late], model)
     nq, nv = model.nq, model.nv
-    out = model.dof_frictionloss * turning_of(motion.speed)
+    lacking = model.dof_frictionloss * turning_of(motion.speed)
+    driven = np.zeros_like(lacking)
     for k, (row, command) in enumerate(zip(motion.states, commands, strict=True)):
         data.qpos[:], data.qvel[:], data.qacc[:] = row[:nq], row[nq : nq + nv], row[nq + nv : nq + 2 * nv]
         data.ctrl[regression.actuators] = command
@@ -96,8 +110,9 @@ def _left(regression: Regression, theta: FloatArray, late: int) -> FloatArray:
                 data.act[adr] = value
         mujoco.mj_inverse(model, data)
         mujoco.mj_fwdActuation(model, data)
-        out[k] += data.qfrc_inverse - data.qfrc_actuator
-    return np.asarray(out)
+        driven[k] = data.qfrc_actuator
+        lacking[k] += data.qfrc_inverse - driven[k]
+    return lacking, driven
 
 
 def sizes_of(model: mujoco.MjModel, machine: Machine, regression: Regression, outcome: Outcome) -> Sizes:
@@ -105,17 +120,15 @@ def sizes_of(model: mujoco.MjModel, machine: Machine, regression: Regression, ou
     motion = regression.given_motion
     states = np.concatenate([np.zeros((len(motion.states), 1)), motion.states[:, : model.nq + model.nv]], axis=1)
     plain = Sizes.of(model, machine, states, None)
-    forces = np.abs(motion.asked) + outcome.damping * np.abs(motion.speed) + outcome.friction
-    driven, faster = motion.given[0].sum(axis=-1), motion.resisting[2]
-    force, driven, faster = (np.quantile(np.abs(values), 0.9, axis=0) for values in (forces, driven, faster))
-    force, rotor = (
-        np.maximum(np.maximum(force, driven), 1e-9),
-        driven / np.maximum(faster, 1e-9),
-    )  # what drives can move
+    driven = motion.given[0].sum(axis=-1)
+    lost = np.abs(motion.asked) + outcome.damping * np.abs(motion.speed) + outcome.friction
+    lost, driven, faster = (np.quantile(np.abs(x), 0.9, axis=0) for x in (lost, driven, motion.resisting[2]))
+    force, rotor = np.maximum(np.maximum(lost, driven), 1e-9), driven / np.maximum(faster, 1e-9)  # that drives can move
     at = {joint.name: int(model.joint(joint.name).dofadr[0]) for joint in machine.joints}
-    known = {name: float(force[dof]) for name, dof in at.items() if regression.known[dof]}
-    moved = {name: max(plain.inertia[name], float(rotor[at[name]])) for name in known}
-    return replace(plain, force=plain.force | known, inertia=plain.inertia | moved)
+    known = {name: dof for name, dof in at.items() if regression.known[dof]}
+    moved = {name: max(plain.inertia[name], float(rotor[dof])) for name, dof in known.items()}
+    forces = {name: float(force[dof]) for name, dof in known.items()}
+    return replace(plain, force=plain.force | forces, inertia=plain.inertia | moved)
 
 
 def inform_bounds(
@@ -132,26 +145,20 @@ def inform_bounds(
         if name in actuators and one.relative and field in ("kp", "gain", "resistance", "motor_constant"):
             gain, error = (float(x[actuators.index(name)]) for x in (outcome.gains, outcome.errors))
             if gain > 3 * error:
-                gain, own = (1 / gain if field == "resistance" else gain), bind(model, one.targets[0]).value
-                values[one.name] = gain * own
-                one = _around(one, gain, own)
+                times, own = (1 / gain if field == "resistance" else gain), bind(model, one.targets[0]).value
+                values[one.name] = value = times * own
+                if own > 0 and not one.low < times < one.high:  # the model's own value at most at an end
+                    ends = float(f"{min(value / 10, own):.2g}"), rounded_up(max(value * 10, own))
+                    note = f"{one.note}; the logs say about {value:.2g}"
+                    expected = float(f"{value:.3g}")
+                    one = replace(one, low=ends[0], high=ends[1], relative=False, note=note, expected=expected)
         elif kind == "joint" and field in resistance and not one.relative:
             dof = int(model.joint(name).dofadr[0])
             if regression.known[dof]:
-                value = float(resistance[field][dof])
-                values[one.name] = value  # what the model lacks is in it, too
+                values[one.name] = value = float(resistance[field][dof])  # what the model lacks is in it, too
                 one = replace(one, high=max(one.high, rounded_up(4 * value) if value else 0.0))
         out.append(one)
     return out, values
-
-
-def _around(gain: Proposal, times: float, own: float) -> Proposal:
-    """Bounds around what the logs say, with the model's own value at most at an end."""
-    if gain.low < times < gain.high or own <= 0:
-        return gain
-    note = f"{gain.note}; the logs say about {times * own:.2g}"
-    low, high = float(f"{min(times / 10, 1.0) * own:.2g}"), rounded_up(max(times * 10, 1.0) * own)
-    return replace(gain, low=low, high=high, relative=False, note=note, expected=float(f"{times * own:.3g}"))
 
 
 def choose(
@@ -167,7 +174,20 @@ def choose(
         if sum(not p.left_out for p in select_identifiable(some, fit, open_scale, len(some))) <= MOST:
             break
         some, fit = share_parameters(some, fit, alike_parts(model, some, field), field)
-    return select_identifiable(some, fit, open_scale), fit.theta
+    some = select_identifiable(some, fit, open_scale)
+    spread = np.sqrt(np.diag(np.linalg.inv(fit.jacobian.T @ fit.jacobian + np.eye(len(fit.theta)) / 0.4**2)))
+    least = np.maximum(10 * fit.theta, fit.theta + 5 * spread)[: len(some)]
+    rough = Sizes.of(model, Machine.of(model), None, None)
+    return [_limited(model, one, float(share), rough) for one, share in zip(some, least, strict=True)], fit.theta
+
+
+def _limited(model: mujoco.MjModel, one: Proposal, share: float, rough: Sizes) -> Proposal:
+    """A resistance up to a share of its bound, at least that of the model alone: slow logs would tell any rotor."""
+    fields = [target.rpartition(".") for target in one.targets]
+    if one.relative or fields[0][2] not in RESISTANCE:
+        return one
+    alone = [propose_of_joint(model, owner, [RESISTANCE[field]], rough)[0].high for owner, _, field in fields]
+    return replace(one, high=min(one.high, max([*alone, rounded_up(share * one.high)])))
 
 
 def select_identifiable(
@@ -183,31 +203,35 @@ def select_identifiable(
         open_scale: whether forces and masses are known relative to each other alone: masses are left out then.
         most: of how many no more are free.
     """
-    masses = [k for k, one in enumerate(proposals) if any(t.endswith(".mass") for t in one.targets)]
-    scale = masses if open_scale and len(masses) < len(proposals) else []
+    masses = [any(target.endswith(".mass") for target in one.targets) for one in proposals]
     kept, out = list[int](), []
     for k, one in enumerate(proposals):
-        effect = fit.effects[:, k]
-        size, reason = float(np.linalg.norm(effect)), ""
-        if k in scale:
-            reason = RELATIVE
-        elif size < 3:  # of the noise
-            reason = "moves too little in these logs"
-        elif kept:
-            basis = fit.effects[:, kept]
-            weights = np.linalg.lstsq(basis, effect, rcond=None)[0]
-            alone = float(np.linalg.norm(effect - basis @ weights))
-            costs = alone * abs(float(fit.theta[k] - fit.nominal[k])) > 3 and alone > 0.01 * size  # slopes' accuracy
-            if not costs and (alone < 0.05 * size or alone < min(0.15 * size, 15)):
-                share = np.abs(weights) * np.linalg.norm(basis, axis=0)
-                most_alike = [i for i in np.argsort(-share)[:2] if share[i] > 0.3 * size] or [int(np.argmax(share))]
-                reason = f"shows as {' and '.join(proposals[kept[i]].name for i in most_alike)} does in these logs"
+        relative = open_scale and masses[k] and not all(masses)
+        reason = RELATIVE if relative else _hidden(proposals, fit, k, kept)
         if not reason and len(kept) >= most:
             reason = f"{most} are enough to begin with"
-        if not reason:
-            kept.append(k)
+        kept += [k] * (not reason)
         out.append(replace(one, left_out=reason))
     return out
+
+
+def _hidden(proposals: Sequence[Proposal], fit: Fit, k: int, kept: Sequence[int]) -> str:
+    """Why proposal ``k`` is not identifiable beside those that are kept; "" where it is."""
+    effect = fit.jacobian[:, k]
+    size = float(np.linalg.norm(effect))
+    if size < 3:  # of the noise
+        return "moves too little in these logs"
+    if not kept:
+        return ""
+    basis = fit.jacobian[:, kept]
+    weights = np.linalg.lstsq(basis, effect, rcond=None)[0]
+    alone = float(np.linalg.norm(effect - basis @ weights))
+    costs = alone * abs(float(fit.theta[k] - fit.nominal[k])) > 3 and alone > 0.01 * size  # slopes' accuracy
+    if costs or alone >= max(0.05 * size, min(0.15 * size, 15)):
+        return ""
+    share = np.abs(weights) * np.linalg.norm(basis, axis=0)
+    most_alike = [i for i in np.argsort(-share)[:2] if share[i] > 0.3 * size] or [int(np.argmax(share))]
+    return f"shows as {' and '.join(proposals[kept[i]].name for i in most_alike)} does in these logs"
 
 
 def widen_bounds(model: mujoco.MjModel, proposal: Proposal, theta: float) -> Proposal:
@@ -240,7 +264,7 @@ def find_springs(
     free, remarks = [], []
     for k, spring in enumerate(springs, len(fit.theta) - len(springs)):
         theta, target = float(fit.theta[k]), spring.targets[0]
-        if np.linalg.norm(fit.effects[:, k]) * theta <= 15 or theta <= 0.03:  # of the noise; of its range
+        if np.linalg.norm(fit.jacobian[:, k]) * theta <= 15 or theta <= 0.03:  # of the noise; of its range
             continue
         joint = model.joint(target.removeprefix("joint:").removesuffix(".stiffness"))
         places = [*states[:, 1 + int(joint.qposadr[0])], float(model.qpos_spring[joint.qposadr[0]])]
@@ -286,23 +310,27 @@ def share_parameters(
     proposals: Sequence[Proposal], fit: Fit, groups: Sequence[Sequence[int]], field: str
 ) -> tuple[list[Proposal], Fit]:
     """The proposals of each group as one, and a fit with these; what stands behind them in the fit is left out."""
-    merged, theta, nominal, columns = list[Proposal](), [], [], []
-    for group in map(list, groups):
-        some = [proposals[k] for k in group]
-        low, high = min(p.low for p in some), max(p.high for p in some)
-        spans, at = np.array([p.high - p.low for p in some]), np.array([p.low for p in some]) - low
-        theta.append(np.mean(at + spans * fit.theta[group]) / (high - low))
-        nominal.append(np.mean(at + spans * fit.nominal[group]) / (high - low))
-        columns.append(fit.jacobian[:, group] @ ((high - low) / spans))
-        one = some[0]
+    lows, highs = np.array([(one.low, one.high) for one in proposals]).T
+    low = np.array([lows[list(group)].min() for group in groups])
+    high = np.array([highs[list(group)].max() for group in groups])
+    merged = list[Proposal]()
+    for group, least, most in zip(groups, low.tolist(), high.tolist(), strict=True):
+        one, some = proposals[group[0]], [proposals[k] for k in group]
         if len(some) > 1:
-            owners = [p.targets[0].rpartition(".")[0].partition(":")[2] for p in some]
-            note = f"{one.note}; one for {', '.join(owners)}, which are alike in the model: a table for each if they"
+            owners = ", ".join(p.targets[0].rpartition(".")[0].partition(":")[2] for p in some)
+            note = f"{one.note}; one for {owners}, which are alike in the model: a table for each if they differ"
             name = _shared_name(some, field, {p.name for p in (*proposals, *merged)})
             targets = tuple(target for p in some for target in p.targets)
-            one = replace(one, name=name, targets=targets, low=low, high=high, note=f"{note} differ")
+            one = replace(one, name=name, targets=targets, low=least, high=most, note=note)
         merged.append(one)
-    return merged, Fit(np.array(theta), np.array(nominal), np.stack(columns, axis=1))
+
+    def mean_of(theta: FloatArray) -> FloatArray:
+        values = lows + (highs - lows) * theta[: len(proposals)]
+        return (np.array([values[list(group)].mean() for group in groups]) - low) / (high - low)
+
+    slopes = fit.jacobian[:, : len(proposals)] / (highs - lows)
+    jacobian = np.stack([slopes[:, list(group)].sum(axis=1) for group in groups], axis=1) * (high - low)
+    return merged, Fit(mean_of(fit.theta), mean_of(fit.nominal), jacobian)
 
 
 def _shared_name(some: Sequence[Proposal], field: str, taken: set[str]) -> str:

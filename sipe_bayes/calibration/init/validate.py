@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import itertools
 import os
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
+from typing import NamedTuple
 
 from sipe_bayes.calibration.column_names import read_name
 from sipe_bayes.calibration.config import Config, load_config
-from sipe_bayes.calibration.config_tables import Command, Measurement
 from sipe_bayes.calibration.gathered import no_rigid_bodies
 from sipe_bayes.calibration.init.cases import Scene, Source, rough_parameters, tried_part
 from sipe_bayes.calibration.init.decisions import DECIDED, Case, Search, decide, search_answers
@@ -28,27 +26,19 @@ from sipe_bayes.calibration.readers.tables import read_table
 from sipe_bayes.calibration.signals import turn_of
 from sipe_bayes.core.finding_advice import ADVICE
 from sipe_bayes.core.trajectory import Trajectory
-from sipe_bayes.core.units import find_unit
 from sipe_bayes.envs.foreign.load import compile_spec, load_spec
 from sipe_bayes.posterior import prior
 
 _LOGS = 3  # that are looked at
 _BETTER = 2 * DECIDED  # nats, from which another reading is named
 _LOST, _PAIRS = 0.3, 60  # of a joint's forces, from which columns may be swapped; pairs that are tried
-_ROOM = 0.05  # of a ctrlrange, by which a command may lie beyond it
 
 
-@dataclass(frozen=True)
-class Validated:
-    """What was found in a configuration.
+class Validated(NamedTuple):
+    """What was found in a configuration."""
 
-    Args:
-        odd: one line for each thing that the logs speak against.
-        doubts: one line for each that they can not tell.
-    """
-
-    odd: list[str]
-    doubts: list[str]
+    odd: list[str]  # one line for each thing that the logs speak against
+    doubts: list[str]  # one line for each that they can not tell
 
 
 def validate_config(path: Path) -> Validated:
@@ -62,25 +52,23 @@ def validate_config(path: Path) -> Validated:
     config = load_config(path)
     environment = environment_of(config, config.logs_for("train"), config.logs_for("holdout"))  # raises as a run
     bodies = no_rigid_bodies(environment, prior(environment.space), 0, prior=True)
-    folder = path.parent
     model = compile_spec(load_spec(str(config.model)), str(config.model))
     machine = Machine.of(model)
     train = sorted(config.logs_for("train"), key=lambda log: bool(log.added))[:_LOGS]  # with a load, another machine
     opened = open_table(train[0].file, read_table(train[0].file, (), config.columns.names), config.columns.time.rate)
-    draft = _draft_of(config, opened, folder)
+    draft = _draft_of(config, opened, path.parent)
     part = tried_part(draft)
     part = replace(part, parameters=rough_parameters(model, machine, draft.readings))
     sources = [Source(log.file, log.episodes[0] if log.episodes else None, log.span) for log in train]
-    case = Scene(model, machine, sources, folder).case(part)
+    case = Scene(model, machine, sources, path.parent).case(part)
     search = search_answers(case)
     better = decide(search)
     out = [f"parameters: {one.text}. {ADVICE[one.code]}" for one in bodies]
     out += _other_readings(search, part, better)
     out = out or _swapped(case)
     out += find_oddities(case, opened)
-    if not out:
-        out += _delays(config, case)
-    out += _clipped(config, draft, machine, opened) + _slopes(draft, opened) + _turns(draft, opened)
+    out = out or _delays(config, case)
+    out += _slopes(draft, opened) + _turns(draft, opened)
     return Validated(out, [doubt for doubt in better.open_doubts if doubt != draft.clock.doubt])
 
 
@@ -102,59 +90,54 @@ def _delays(config: Config, case: Case) -> list[str]:
 def _draft_of(config: Config, opened: Opened, folder: Path) -> Draft:
     """The configuration as a draft whose columns' names say no units."""
 
-    def reading(entry: Command | Measurement, columns: tuple[str, ...]) -> Reading:
-        label = replace(read_name(columns[0]), unit="")
-        quaternion = (entry.quaternion or "") if isinstance(entry, Measurement) else ""
-        match = Match(columns, entry.target, label, 1.0, quaternion)
-        wraps = isinstance(entry, Measurement) and entry.wraps
-        feed = entry.supply if isinstance(entry, Command) and entry.rate is None else None
-        supply = None if feed is None else (feed.column, feed.unit)
-        return Reading(match, entry.unit, entry.sign, entry.factor, entry.zero, wraps=wraps, supply=supply)
+    def match(target: str, columns: tuple[str, ...], quaternion: str | None = None) -> Match:
+        return Match(columns, target, replace(read_name(columns[0]), unit=""), 1.0, quaternion or "")
 
-    clock = replace(opened.clock, column=config.columns.time.column, unit=config.columns.time.unit)
-    return Draft(
-        Path(os.path.relpath(config.model, folder)).as_posix(),
-        clock,
-        config.columns.episode,
-        tuple(reading(c, (c.column,)) for c in config.commands),
-        tuple(reading(m, m.sources) for m in config.measurements),
-        (LogLine(str(config.logs[0].file.resolve())),),
-        "log",
-        names=config.columns.names,
+    duties = [c.supply if c.rate is None else None for c in config.commands]
+    supplies = [None if feed is None else (feed.column, feed.unit) for feed in duties]
+    commands = tuple(
+        Reading(match(c.target, (c.column,)), c.unit, c.sign, c.factor, c.zero, supply=supply)
+        for c, supply in zip(config.commands, supplies, strict=True)
     )
+    measurements = tuple(
+        Reading(match(m.target, m.sources, m.quaternion), m.unit, m.sign, m.factor, m.zero, wraps=m.wraps)
+        for m in config.measurements
+    )
+    clock = replace(opened.clock, column=config.columns.time.column, unit=config.columns.time.unit)
+    logs, names = (LogLine(str(config.logs[0].file.resolve())),), config.columns.names
+    model = Path(os.path.relpath(config.model, folder)).as_posix()
+    return Draft(model, clock, config.columns.episode, commands, measurements, logs, "log", names=names)
 
 
 def _swapped(case: Case) -> list[str]:
-    """Two columns of commands, or of positions, with which more is explained the other way round."""
-    regression, out = case.regression, []
-    now, environment = case.nats(regression.fit(regression.given)), regression.environment
-    lost = regression.fit(regression.given).miss[regression.known]
-    if not len(lost) or lost.max() < _LOST:
+    """Two columns of commands, or of positions, with which most more is explained the other way round."""
+    regression, readings = case.regression, case.draft.readings
+    outcome, best = regression.fit(regression.given), _BETTER
+    out: list[str] = []
+    if outcome.miss[regression.known].max(initial=0.0) < _LOST:
         return []
-    columns = [(k, case.commands[k], case.channels[k][:1]) for k in range(len(case.draft.readings))]
-    for (a, i, at), (b, j, to) in itertools.islice(itertools.combinations(columns, 2), _PAIRS):
-        one, other = case.draft.readings[a], case.draft.readings[b]
-        if (
-            one.commanded != other.commanded
-            or one.unit != other.unit
-            or len(one.match.columns + other.match.columns) > 2
-        ):
+    for a, b in itertools.islice(itertools.combinations(range(len(readings)), 2), _PAIRS):
+        one, other = readings[a], readings[b]
+        several = len(one.match.columns + other.match.columns) > 2
+        if several or (one.commanded, one.unit) != (other.commanded, other.unit):
             continue
         logs = []
         for log in regression.logs:
             actions, seen = log.actions.copy(), log.observations.copy()
-            if i is not None and j is not None:
+            if one.commanded:
+                i, j = case.commands[a], case.commands[b]
                 actions[:, [i, j]] = actions[:, [j, i]]
             else:
-                seen[:, [*at, *to]] = seen[:, [*to, *at]]
+                i, j = case.channels[a][0], case.channels[b][0]
+                seen[:, [i, j]] = seen[:, [j, i]]
             logs.append(Trajectory(seen, actions, log.dt))
-        there = Regression(environment, logs, regression.delays)
+        there = Regression(regression.environment, logs, regression.delays)
         there.one_way, there.scales, there.springs = regression.one_way, regression.scales, regression.springs
-        gain = now - case.nats(there.fit(there.given))
-        if gain > _BETTER:
+        gain = case.nats(outcome) - case.nats(there.fit(there.given))
+        if gain > best:
             names = f"columns {one.match.column!r} and {other.match.column!r}"
-            out.append((gain, f"{names} look swapped: the model explains far more the other way round"))
-    return [max(out)[1]] if out else []
+            best, out = gain, [f"{names} look swapped: the model explains far more the other way round"]
+    return out
 
 
 def _other_readings(search: Search, part: Draft, better: Draft) -> list[str]:
@@ -176,25 +159,6 @@ def _other_readings(search: Search, part: Draft, better: Draft) -> list[str]:
             out.append(f"{where}: unit {one.unit!r} is odd, {other.unit!r} {more}{but}")
         if one.sign != other.sign:
             out.append(f"{where}: sign {one.sign} is odd, {other.sign} {more}")
-    return out
-
-
-def _clipped(config: Config, draft: Draft, machine: Machine, opened: Opened) -> list[str]:
-    """Commands most of which the ctrlrange of their actuator cuts off."""
-    limits = {f"actuator:{actuator.name}": actuator.limits for actuator in machine.actuators}
-    out = []
-    for entry, r in zip(config.commands, draft.commands, strict=True):
-        ends, fed = limits.get(r.match.target), (r.supply[0],) if r.supply else ()
-        if ends is None or entry.rate is not None or any(name not in opened.columns for name in (r.match.column, *fed)):
-            continue
-        values = (opened.columns[r.match.column] - r.zero) * r.sign * r.factor * find_unit(r.unit).factor
-        if r.supply:
-            values = values * opened.columns[r.supply[0]] * find_unit(r.supply[1]).factor
-        room = _ROOM * (ends[1] - ends[0])
-        share = float(np.mean((values < ends[0] - room) | (values > ends[1] + room)))
-        if share > 0.5:
-            where = f"commands, column {r.match.column!r}: {100 * share:.0f} % of it lies outside of the ctrlrange"
-            out.append(f"{where} {list(ends)} of {r.match.target}, which cuts it off; look at its factor, zero, supply")
     return out
 
 

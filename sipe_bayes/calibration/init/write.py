@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sipe_bayes.calibration.config import load_config
-from sipe_bayes.calibration.init.draft import Draft, Proposal, Reading
+from sipe_bayes.calibration.init.draft import Draft, Proposal, Reading, Row
 from sipe_bayes.calibration.logs import load_log
 from sipe_bayes.core.files import printed
 from sipe_bayes.core.toml import to_toml
@@ -18,26 +18,26 @@ from sipe_bayes.core.units import find_unit
 
 def toml_of(draft: Draft, command: str) -> str:
     """The whole file; command: what wrote it."""
-    notes = [f"Written by: {command}", *_unused(draft), *draft.notes]
-    parts = [*map(_comment, notes), *map(_open, draft.doubts)]
-    text = "\n".join(parts) + "\n\n" + to_toml({"model": draft.model, **draft.likelihood}).rstrip("\n")
-    text += f" # {printed(draft.window_note)}\n"
-    inline = len(draft.logs) > 5  # which then stand on one line each
-    if inline:
-        rows = [to_toml({"row": [log.row()]}) for log in draft.logs]
-        lines = ["{" + ", ".join(row.splitlines()[1:]) + "}" for row in rows]
-        text += "logs = [\n" + "".join(f"    {line},\n" for line in lines) + "]\n"
-    clock = draft.clock
-    text += "\n[columns]\n" + "".join(f"{_open(clock.doubt)}\n" for _ in range(bool(clock.doubt)))
-    text += to_toml({"row": [{"time": clock.row}]}).splitlines()[1] + f" # {printed(clock.why)}\n"
-    text += to_toml({"episode": draft.episode} if draft.episode else {})
-    text += to_toml({"names": list(draft.names)} if draft.names else {})
+    clock, inline = draft.clock, len(draft.logs) > 5  # which then stand on one line each
+    logs = [f"    {{{', '.join(_lines(log.row()))}}}," for log in draft.logs]
+    lines = [_comment(note) for note in (f"Written by: {command}", *_unused(draft), *draft.notes)]
+    lines += [*map(_open, draft.doubts), "", *_lines({"model": draft.model, **draft.likelihood})]
+    lines[-1] += f" # {printed(draft.window_note)}"
+    lines += ["logs = [", *logs, "]"] * inline
+    lines += ["", "[columns]", *map(_open, [clock.doubt] * bool(clock.doubt)), *_lines({"time": clock.row})]
+    lines[-1] += f" # {printed(clock.why)}"
+    lines += _lines({"episode": draft.episode} if draft.episode else {})
+    lines += _lines({"names": list(draft.names)} if draft.names else {})
     blocks = [_reading("commands", reading) for reading in draft.commands]
     blocks += [_reading("measurements", reading) for reading in draft.measurements]
-    if not inline:
-        blocks += [to_toml({"logs": [log.row()]}) for log in draft.logs]
+    blocks += [] if inline else [to_toml({"logs": [log.row()]}) for log in draft.logs]
     blocks += [_parameter(one) for one in draft.parameters]
-    return text + "\n" + "\n".join(blocks)
+    return "\n".join([*lines, "", *blocks])
+
+
+def _lines(table: Row) -> list[str]:
+    """The lines of a table, each key on one."""
+    return to_toml({"row": [table]}).splitlines()[1:]
 
 
 def _comment(text: str) -> str:
@@ -50,11 +50,9 @@ def _open(doubt: str) -> str:
 
 def _reading(table: str, reading: Reading) -> str:
     """A command or measurement: evidence, what is open, its keys, and what would stand there instead."""
-    lines = [_comment(note) for note in (*reading.notes, *_of_range(reading))]
-    lines += [_open(doubt) for doubt in reading.doubts]
-    body = to_toml({table: [reading.row()]}).rstrip("\n")
+    notes = [*map(_comment, (*reading.notes, *_of_range(reading))), *map(_open, reading.doubts)]
     instead = [f"# {printed(line)}" for line in reading.instead]
-    return "\n".join([*lines, body, *instead]) + "\n"
+    return "\n".join([*notes, f"[[{table}]]", *_lines(reading.row()), *instead, ""])
 
 
 def _of_range(reading: Reading) -> list[str]:
@@ -124,19 +122,16 @@ def plot_columns(draft: Draft, path: Path) -> Path:
 
     config = load_config(path)
     log, _ = load_log(config, config.logs[0])
-    time = log.dt * np.arange(len(log) + 1)
     names = [*config.channels, *(f"command {reading.match.column}" for reading in draft.commands)]
     values = np.concatenate([log.observations, np.concatenate([log.actions, log.actions[-1:]])], axis=1)
-    units = [find_unit(m.unit).si for m in config.measurements for _ in m.channels]
-    units += [find_unit(reading.unit).si for reading in draft.commands]
+    words = [m.unit for m in config.measurements for _ in m.channels] + [reading.unit for reading in draft.commands]
     figure = Figure(figsize=(9.0, 1.3 * max(2, len(names))), layout="constrained")
-    for axes, name, unit, series in zip(
-        np.ravel(figure.subplots(len(names), sharex=True, squeeze=False)), names, units, values.T, strict=True
-    ):
-        axes.plot(time, series, linewidth=0.8)
-        axes.set_title(f"{name} [{unit}]", fontsize=8, loc="left")
+    rows = figure.subplots(len(names), sharex=True, squeeze=False)[:, 0]
+    for axes, name, word, series in zip(rows, names, words, values.T, strict=True):
+        axes.plot(log.dt * np.arange(len(log) + 1), series, linewidth=0.8)
+        axes.set_title(f"{name} [{find_unit(word).si}]", fontsize=8, loc="left")
         axes.tick_params(labelsize=7)
-    axes.set_xlabel("time [s]", fontsize=8)
+    rows[-1].set_xlabel("time [s]", fontsize=8)
     target = path.with_suffix(".png")
     figure.savefig(target, dpi=110)
     return target

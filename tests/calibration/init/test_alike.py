@@ -9,6 +9,7 @@ from sipe_bayes.calibration.init.draft import Proposal
 from sipe_bayes.calibration.init.selection import MOST, Fit, alike_parts, choose, share_parameters
 
 LEGS = ("FL", "FR", "RL", "RR")
+JOINTS = [f"{side}_{joint}" for side in LEGS for joint in ("hip", "knee")]
 
 
 def leg(name: str, hip: str = "", mass: float = 0.3) -> str:
@@ -19,8 +20,7 @@ def leg(name: str, hip: str = "", mass: float = 0.3) -> str:
 
 
 def model_of(legs: str, kp: dict[str, float]) -> mujoco.MjModel:
-    joints = [f"{side}_{joint}" for side in LEGS for joint in ("hip", "knee")]
-    servos = "".join(f'<position name="{j}" joint="{j}" kp="{kp.get(j, 20.0)}"/>' for j in joints)
+    servos = "".join(f'<position name="{j}" joint="{j}" kp="{kp.get(j, 20.0)}"/>' for j in JOINTS)
     return mujoco.MjModel.from_xml_string(
         f'<mujoco><worldbody><body name="trunk"><freejoint/><geom size=".1" mass="5"/>{legs}</body></worldbody>'
         f"<actuator>{servos}</actuator></mujoco>"
@@ -39,9 +39,7 @@ def test_who_shares() -> None:
     """Joints of which the model says nothing by their names, others by what it says; masses by both."""
     legs = leg("FL") + leg("FR") + leg("RL", 'damping=".2"') + leg("RR", 'damping=".2"', mass=0.4)
     model = model_of(legs, {"RR_knee": 25.0})
-    frictions = [
-        unknown(f"{j}_damping", f"joint:{j}.damping") for side in LEGS for j in (f"{side}_hip", f"{side}_knee")
-    ]
+    frictions = [unknown(f"{j}_damping", f"joint:{j}.damping") for j in JOINTS]
     assert sorted(names(model, frictions, "damping"), key=sorted) == [
         {"FL_hip_damping", "FR_hip_damping"},
         {"FL_knee_damping", "FR_knee_damping", "RL_knee_damping"},
@@ -59,10 +57,8 @@ def test_who_shares() -> None:
 
 def test_what_one_parameter_does_is_what_all_of_them_do() -> None:
     """In units of the shared bounds, at the mean of the values."""
-    unknowns = [
-        unknown("FL_hip_damping", "joint:FL_hip.damping"),
-        unknown("FR_hip_damping", "joint:FR_hip.damping", 2.0),
-    ]
+    first = unknown("FL_hip_damping", "joint:FL_hip.damping")
+    unknowns = [first, unknown("FR_hip_damping", "joint:FR_hip.damping", 2.0)]
     jacobian = np.random.default_rng(0).standard_normal((50, 3))  # and of what stands behind them
     fit = Fit(np.array([0.4, 0.1, 0.9]), np.array([0.2, 0.1, 0.0]), jacobian)
     (one,), after = share_parameters(unknowns, fit, [[0, 1]], "damping")
@@ -74,12 +70,11 @@ def test_what_one_parameter_does_is_what_all_of_them_do() -> None:
 
 def test_only_as_many_share_as_is_needed() -> None:
     model = model_of("".join(leg(side) for side in LEGS), {})
-    joints = [f"{side}_{joint}" for side in LEGS for joint in ("hip", "knee")]
     rng = np.random.default_rng(1)
 
     def asked(fields: tuple[str, ...]) -> list[str]:
-        unknowns = [unknown(f"{j}_kp", f"actuator:{j}.kp", relative=True) for j in joints]
-        unknowns += [unknown(f"{j}_{field}", f"joint:{j}.{field}") for j in joints for field in fields]
+        unknowns = [unknown(f"{j}_kp", f"actuator:{j}.kp", relative=True) for j in JOINTS]
+        unknowns += [unknown(f"{j}_{field}", f"joint:{j}.{field}") for j in JOINTS for field in fields]
         n = len(unknowns)
         fit = Fit(np.full(n, 0.5), np.zeros(n), 100 * rng.standard_normal((400, n)))
         left, values = choose(model, unknowns, fit, False)

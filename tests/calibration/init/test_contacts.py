@@ -85,9 +85,7 @@ TYRES = ("tyre_left", "tyre_right")
         (rover("", named=False), "", {"chassis_friction": (("hull", "floor"), 0.02)}),
     ],
 )
-def test_frictions_that_are_asked_for(
-    bodies: str, floor: str, expected: dict[str, tuple[tuple[str, ...], float]]
-) -> None:
+def test_frictions_that_are_free(bodies: str, floor: str, expected: dict[str, tuple[tuple[str, ...], float]]) -> None:
     assert frictions(asked(bodies, floor)) == expected
 
 

@@ -43,9 +43,7 @@ def driven(folder: Path, model: str, limits: str, factor: float, column: str = "
         (' ctrlrange="0 1"', -20.0, 1, "and with the other sign too"),
     ],
 )
-def test_commands_that_a_range_clips_altogether(
-    tmp_path: Path, limits: str, factor: float, sign: int, words: str
-) -> None:
+def test_commands_that_a_range_clips_all(tmp_path: Path, limits: str, factor: float, sign: int, words: str) -> None:
     draft = driven(tmp_path, PENDULUM, limits, factor)
     (command,) = draft.commands
     about = [doubt for doubt in command.doubts if "ctrlrange" in doubt]
@@ -76,9 +74,7 @@ SPATIAL = '<spatial name="cable"><site site="winch"/><site site="tip"/></spatial
 
 @pytest.mark.parametrize("cable", [FIXED, SPATIAL])
 @pytest.mark.parametrize("column", ["u", "winch_torque", "cable_N"])
-def test_the_gain_of_a_tendon_is_asked_for_unless_its_command_is_a_force(
-    tmp_path: Path, cable: str, column: str
-) -> None:
+def test_the_gain_of_a_tendon_is_free_unless_its_command_is_a_force(tmp_path: Path, cable: str, column: str) -> None:
     model = FINGER.format(cable) + "<!--{}-->"
     draft = driven(tmp_path, model, "", 1.0, column)
     units = {"u": "1", "winch_torque": "N m" if cable == FIXED else "N", "cable_N": "N"}

@@ -52,7 +52,8 @@ def test_efforts_are_measured_with_their_sign_and_unit_and_make_forces_known(tmp
         "joint:elbow.force": ("mN m", -1, "effort_elbow"),
     }
     assert not any("no force is known" in doubt for doubt in draft.doubts)
-    assert {"upper_mass", "lower_mass"} <= {unknown.name for unknown in draft.free}
+    both = {"shoulder_damping", "elbow_damping", "shoulder_servo_kv", "elbow_servo_kv"}  # which efforts tell apart
+    assert {"upper_mass", "lower_mass"} | both <= {unknown.name for unknown in draft.free}
     assert draft.config(tmp_path)
 
 
@@ -68,6 +69,7 @@ def test_rotors_that_the_model_lacks_are_free_and_no_delay(tmp_path: Path) -> No
     """Of ten times the inertia of the lower link, with friction that goes with such gears."""
     draft = proposed(tmp_path, {"shoulder": 1.0, "elbow": 1.0}, "current_{}_A", rotor=0.05)
     free = {unknown.name: (unknown.low, unknown.high) for unknown in draft.free}
+    assert not {"shoulder_damping", "elbow_damping"} & {*free}
     assert draft.delay < 0.5
     for joint in ("shoulder", "elbow"):
         assert free[f"{joint}_armature"][1] > 0.05
@@ -90,7 +92,7 @@ def test_what_is_no_effort_is_named_and_left(tmp_path: Path, scales: dict[str, f
     assert any("no force is known" in doubt for doubt in draft.doubts)
 
 
-def test_an_effort_without_a_unit_that_is_larger_than_the_models_is_open_and_makes_no_force_known(
+def test_an_effort_without_a_unit_that_is_larger_than_the_models_is_open_and_no_known_force(
     tmp_path: Path,
 ) -> None:
     draft = proposed(tmp_path, {"shoulder": 2.5, "elbow": 2.5})

@@ -227,9 +227,7 @@ TIED = """<mujoco><option timestep="0.005"/><worldbody>
 
 
 @pytest.mark.parametrize(("measured", "blind"), [("position", False), ("velocity", True)])
-def test_what_a_chain_ties_to_a_velocity_alone_starts_where_the_model_does(
-    tmp_path: Path, measured: str, blind: bool
-) -> None:
+def test_what_a_chain_ties_to_a_velocity_alone_starts_as_the_model(tmp_path: Path, measured: str, blind: bool) -> None:
     (tmp_path / "model.xml").write_text(TIED)
     time = 0.01 * np.arange(150)
     columns = {"time": time, "hinge_position": 0.3 * np.cos(4 * time), f"crank_{measured}": 0.2 * np.sin(4 * time)}

@@ -15,8 +15,7 @@ from sipe_bayes.calibration.init.write import toml_of
 from sipe_bayes.core.arrays import FloatArray
 
 BOOM = """<mujoco><option timestep="0.002" integrator="implicitfast" gravity="0 0 {gravity}"/><worldbody>
-  <body name="mast">
-  <joint name="slew" axis="0 0 1" damping=".3"/>
+  <body name="mast"><joint name="slew" axis="0 0 1" damping=".3"/>
   <geom type="box" size=".05 .05 .2" mass="1" contype="0" conaffinity="0"/>
   <body name="boom" pos="0 0 .2"><joint name="luff" axis="0 1 0" damping=".3"/>
   <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass=".5" contype="0" conaffinity="0"/>

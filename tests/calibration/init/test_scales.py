@@ -147,9 +147,7 @@ def test_an_inertial_unit_that_alone_tells_of_a_body_is_fitted_with_its_biases(t
         ),
     ],
 )
-def test_what_may_be_right_as_well_stands_in_one_line(
-    answer: Scale, rivals: list[tuple[Scale, float]], words: str
-) -> None:
+def test_what_may_be_right_as_well_is_one_line(answer: Scale, rivals: list[tuple[Scale, float]], words: str) -> None:
     """The nearest first; of counts the number alone."""
     assert as_well(answer, rivals) == words
 
