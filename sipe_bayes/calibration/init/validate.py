@@ -125,8 +125,8 @@ def _swapped(case: Case) -> list[str]:
         for log in regression.logs:
             actions, seen = log.actions.copy(), log.observations.copy()
             if one.commanded:
-                i, j = case.commands[a], case.commands[b]
-                actions[:, [i, j]] = actions[:, [j, i]]
+                both = np.array([case.commands[a], case.commands[b]], int)
+                actions[:, both] = actions[:, both[::-1]]
             else:
                 i, j = case.channels[a][0], case.channels[b][0]
                 seen[:, [i, j]] = seen[:, [j, i]]
