@@ -91,7 +91,8 @@ def _describe(
     if eigenvalues[0] > THRESHOLDS.ridge:
         return None
     loadings = np.abs(vectors[:, 0])
-    kept, largest = _members(loadings), int(np.argmax(loadings))
+    kept = _members(loadings)
+    largest = int(np.argmax(loadings > loadings.max() - 1e-9))  # of equal ones the first
     weights = vectors[:, 0] / x.std(0)
     weights = weights[kept] / weights[largest]
     names, units = ([getattr(space[members[k]], what) for k in kept] for what in ("name", "unit"))

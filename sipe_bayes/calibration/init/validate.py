@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from sipe_bayes.calibration.column_names import read_name
 from sipe_bayes.calibration.config import Config, load_config
 from sipe_bayes.calibration.gathered import no_rigid_bodies
