@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import json
 import tomllib
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -192,8 +194,12 @@ def test_start_of_an_unknown_parameter_is_one_line(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_killed_search_goes_on_to_the_same_bits(case: tuple[Path, Discovery], tmp_path: Path) -> None:
+def test_killed_search_goes_on_to_the_same_bits(
+    case: tuple[Path, Discovery], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _, found = case
+    clock = SimpleNamespace(monotonic=itertools.count(0, 10).__next__)  # each step is kept, however fast it was
+    monkeypatch.setattr("sipe_bayes.structure.discovery.time", clock)
     config = write_lacking(tmp_path)
     # inside the first fit; where the second and the third step begin; inside the one that comes first then
     for stage, calls, kept in ((1, 3, False), (2, 1, True), (3, 1, True), (1, 2, True)):
