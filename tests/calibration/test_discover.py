@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import sipe_bayes as sipe
+from sipe_bayes.calibration import discovery_summary
 from sipe_bayes.calibration.discover import run_discovery
 from sipe_bayes.calibration.discovery_summary import summarise
 from sipe_bayes.calibration.output import CHECKPOINT
@@ -23,7 +24,7 @@ from sipe_bayes.calibration.run import run
 from sipe_bayes.core.files import OutputError
 from sipe_bayes.core.findings import Code
 from sipe_bayes.diagnostics.discovery import Discovery
-from sipe_bayes.diagnostics.records import Misfit
+from sipe_bayes.diagnostics.records import Comparison, Misfit
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.posterior import Particles, Posterior
 from sipe_bayes.report.discovery.words import discovery_verdicts
@@ -313,3 +314,16 @@ def test_a_budget_that_ends_too_soon_is_said_and_what_to_give(tmp_path: Path) ->
     assert onward.settled
     assert [one.label for one in onward.kept] == ["dry_friction:hinge"]
     assert [one.gain for one in onward.kept] == pytest.approx([one.gain for one in at_once.kept], rel=1e-2)
+
+
+@pytest.mark.parametrize(("ratio", "p", "refused"), [(0.8, 0.2, True), (0.8, 0.5, False), (1.3, 0.01, False)])
+def test_a_structure_with_larger_errors_on_held_out_logs_is_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ratio: float, p: float, refused: bool
+) -> None:
+    """Larger by more than one standard error: the report says that it is left out, and why."""
+    monkeypatch.setattr(discovery_summary, "_comparison", lambda *_: Comparison(ratio, 0.7, 1.5, p, 20))
+    found = run_discovery(write_lacking(tmp_path), tmp_path / "out", num_threads=1)
+    assert (found.kept == ()) == refused
+    assert [row.labels for row in found.rows if row.refused] == ([("dry_friction:hinge",)] if refused else [])
+    text = " ".join(one.text for one in discovery_verdicts(found))
+    assert ("held-out logs are predicted worse with it, so it is left out" in text) == refused
