@@ -338,6 +338,7 @@ def main() -> None:
     parser.add_argument("--noises", nargs="+", default=list(NOISES))
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--out", type=Path, default=RUNS)
+    parser.add_argument("--name", default="discover", help="of the files in results/")
     given = parser.parse_args()
     rows = fits(given.out)
     done = {(r["machine"], r["effect"], r["size"], r["noise"], r["seed"]) for r in rows}
@@ -352,10 +353,10 @@ def main() -> None:
                 f"{row['gain']:.1f} ± {row['error']:.1f} {row['seconds']:.0f} s",
                 flush=True,
             )
-            write_text(HERE / "results" / "discover.json", json.dumps(tables(rows), indent=1) + "\n")
-    write_text(HERE / "results" / "discover.json", json.dumps(tables(rows), indent=1) + "\n")
-    picture(rows, HERE / "results" / "discover.png")
-    reliability_picture(rows, HERE / "results" / "discover_weights.png")
+            write_text(HERE / "results" / f"{given.name}.json", json.dumps(tables(rows), indent=1) + "\n")
+    write_text(HERE / "results" / f"{given.name}.json", json.dumps(tables(rows), indent=1) + "\n")
+    picture(rows, HERE / "results" / f"{given.name}.png")
+    reliability_picture(rows, HERE / "results" / f"{given.name}_weights.png")
 
 
 if __name__ == "__main__":
