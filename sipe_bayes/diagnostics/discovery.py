@@ -94,7 +94,6 @@ class Discovery:
         before, after: what the plain and the written model leave.
         signals: of each log and channel; ``mode`` is the written, ``default`` the plain model, calibrated.
         settled: whether every fit that counts converged, and the budget was enough; ``best_settled`` the written one.
-        rollouts: of all fits.
         ended: what cut the search short: its "budget", its "time", or that it was "interrupted"; else nothing.
     """
 

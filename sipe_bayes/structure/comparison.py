@@ -13,11 +13,9 @@ the correlation r: what counts is the effective number of pieces.
 Deviation from Vehtari et al., whose s^2 = K var(d): motions differ in what they tell, and a sum of gains that all have
 one sign, but differ, is no uncertain one.
 
-Structures within two standard errors of the best are **ties**. The set that is reported are those ties of which no part
-is a tie itself, or predicts no worse: an extension that is not needed is not reported. A structure that predicts
-held-out logs worse
-than the plain model by more than a standard error is none of them. **Stacking weights** of a set maximise the mean
-log of the weighted mixture (Y. Yao, A. Vehtari, D. Simpson, A. Gelman 2018, https://doi.org/10.1214/17-BA1091).
+Structures within two standard errors of the best are **ties**; ``choose_ties`` says which of these are reported.
+**Stacking weights** of a set maximise the mean log of the weighted mixture (Y. Yao, A. Vehtari, D. Simpson, A. Gelman
+2018, https://doi.org/10.1214/17-BA1091).
 """
 
 from __future__ import annotations
@@ -30,9 +28,6 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.structure.fitted import FittedStructure
 
-_ERRORS = 2.0  # standard errors within which structures are ties
-_ALIKE = 0.5  # largest correlation of neighbours: motions that tell more follow each other, too
-
 
 class Difference(NamedTuple):
     """Of two structures, in nats: how much better the first one predicts, and the standard error of that."""
@@ -43,7 +38,7 @@ class Difference(NamedTuple):
     @property
     def clear(self) -> bool:
         """Whether the first one predicts better by more than two standard errors."""
-        return self.nats > _ERRORS * self.error
+        return self.nats > 2.0 * self.error
 
 
 def rank(one: FittedStructure) -> tuple[int, float]:
@@ -63,7 +58,7 @@ def difference(one: FittedStructure, other: FittedStructure, since: int = 0) -> 
     opposing, follows = each[each * total < 0], log[1:] == log[:-1]
     apart = each - each.mean() if len(each) else each
     alike = float(apart[1:][follows] @ apart[:-1][follows]) / max(float(apart @ apart), 1e-300)
-    alike = min(max(alike, 0.0), _ALIKE)
+    alike = min(max(alike, 0.0), 0.5)  # motions that tell more follow each other, too
     whitened = np.maximum((one if total > 0 else other).held.square[both], 1.0)
     square = 2 * float(whitened @ np.abs(each)) + 2 * float(opposing @ opposing)
     return Difference(total, float(np.sqrt(square * (1 + alike) / (1 - alike))))
@@ -76,13 +71,13 @@ def choose_ties(structures: Sequence[FittedStructure]) -> list[FittedStructure]:
     """
     best = max(structures, key=rank)
     ties = [one for one in structures if one is best or not difference(best, one).clear]
-    ties = [one for one in ties if all(rank(part) < rank(one) for part in _parts(one, structures))]
-    return [one for one in ties if not _parts(one, ties)]
+    ties = [one for one in ties if all(rank(part) < rank(one) for part in parts_of(one.labels, structures))]
+    return [one for one in ties if not parts_of(one.labels, ties)]
 
 
-def _parts(one: FittedStructure, structures: Sequence[FittedStructure]) -> list[FittedStructure]:
-    """Those with some of its extensions alone."""
-    return [other for other in structures if set(other.labels) < set(one.labels)]
+def parts_of(labels: Sequence[str], structures: Sequence[FittedStructure]) -> list[FittedStructure]:
+    """The structures with some of these extensions alone."""
+    return [one for one in structures if set(one.labels) < set(labels)]
 
 
 def stack(structures: Sequence[FittedStructure]) -> FloatArray:

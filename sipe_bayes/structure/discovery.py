@@ -5,13 +5,12 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from sipe_bayes.core.checkpoint import load_state, save_state
+from sipe_bayes.core.checkpoint import fingerprint_of, load_state, save_state
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.core.validation import MOST_ROLLOUTS, cores, nearest_name, whole
 from sipe_bayes.envs.mjcf import MjcfEnvironment
@@ -70,6 +69,43 @@ class Restriction:
         files = {name: Path(name.rpartition(":")[0]) for name in self.names}
         return {n: hashlib.sha256(f.read_bytes()).hexdigest() for n, f in files.items() if f.suffix == ".py"}
 
+    def environment(self, simulator: Simulator) -> MjcfEnvironment:
+        """The user's model, which has all sites.
+
+        Raises:
+            ValueError: where it has not, or is not an MJCF.
+        """
+        environment = simulator.environment
+        if not isinstance(environment, MjcfEnvironment):
+            raise ValueError("simulator: structures are looked for in a user's MJCF; give a Simulator of one")
+        model = environment.compile()
+        joints = [model.joint(j).name for j in range(model.njnt)]
+        known = [name for name in (*joints, *environment.actuators, *environment.channels) if name]
+        for site in self.sites or ():
+            if site not in known:
+                hint = nearest_name(site, known) or f"; the model has {', '.join(known)}"
+                raise ValueError(f"structure.sites: no joint, actuator or channel {site!r}{hint}")
+        return environment
+
+    def check(self, simulator: Simulator, trajectories: Trajectories, likelihood: Segments) -> None:
+        """See before a search that sites exist, that extensions load, and that each of the user's own finds a place.
+
+        Raises:
+            ValueError: where it is not so; one line with the remedy.
+        """
+        self.environment(simulator)
+        own = [get_extension(name) for name in self.names if name not in EXTENSIONS]
+        if not own:
+            return
+        windows = BoundLikelihood(likelihood, simulator, trajectories)
+        machine = machine_of(windows, np.clip(simulator.space.default_theta, 0, 1), windows.no_starts())
+        for extension in own:
+            if not list(placements(extension, machine)):
+                raise ValueError(
+                    f"structure: extension {extension.name!r} finds no {extension.kind} that it applies to in this "
+                    "model; give its parameters targets that the model has, or leave it out"
+                )
+
 
 def discover(
     simulator: Simulator,
@@ -109,15 +145,31 @@ def discover(
         CheckpointError: for a checkpoint that is damaged or of another run.
         SearchInterrupted: with what the search has, where it is interrupted.
     """
-    began = time.monotonic()
-    given = simulator, trajectories, holdout, prior, likelihood, restriction, options, budget, seed, progress
-    search = _search(*given)
-    fingerprint = _fingerprint(search, simulator, restriction or Restriction())
-    search.fitting = replace(search.fitting, ends=began + time_limit)
-    state = DiscoverState(budget=search.budget)
+    ends = time.monotonic() + time_limit
+    restriction, options = restriction or Restriction(), options or DiscoverOptions()
+    environment = restriction.environment(simulator)
+    extensions = [get_extension(name) for name in restriction.names]
+    memory = sum(extension.memory(float(trajectories.dt.max())) for extension in extensions)
+    late = [(c, float(own) + memory) for c, own in zip(environment.channels, environment.remembers, strict=True)]
+    # a linearisation of the plain model takes a few seconds at most
+    columns = 1 + len(simulator.space) + len(environment.start_sd(simulator.model))
+    seconds = min(options.physics_steps, 2.5e5 / columns) * float(simulator.model.opt.timestep)
+    likelihood = replace(likelihood or Segments(), noise="ar1", seconds=seconds, late=tuple(late))
+    prior = default_prior(environment.space) if prior is None else prior
+    seed, threads = whole("seed", seed, 0), simulator.num_threads or cores()
+    fitting = Fitting(environment, trajectories, holdout, likelihood, prior, seed, threads, ends)
+    if fitting.windows(simulator).impacts:
+        fitting = _between_contacts(fitting, simulator)
+    budget = whole("budget", budget, 1, "rollouts", MOST_ROLLOUTS)
+    search = StructureSearch(fitting, extensions, restriction.sites, budget, progress)
+    logs = digest(fitting.trajectories), None if fitting.holdout is None else digest(fitting.holdout)
+    model = simulator.checksum(), environment.space.to_dict(), fitting.prior.gaussian_moments()
+    tried = restriction, list(EXTENSIONS), restriction.digests
+    fingerprint = fingerprint_of(model, logs, fitting.likelihood, seed, options, tried)
+    state = DiscoverState(budget=budget)
     if checkpoint is not None and checkpoint.exists():
-        enough = search.enough([]) / search.options.plain_share
-        state = load_state(checkpoint, DiscoverState, fingerprint).with_budget(search.budget, enough)
+        enough = fitting.enough([]) / search.plain_share
+        state = load_state(checkpoint, DiscoverState, fingerprint).with_budget(budget, enough)
     saved = -math.inf
     try:
         while not state.done:
@@ -139,77 +191,6 @@ class SearchInterrupted(KeyboardInterrupt):
     def __init__(self, structures: Structures) -> None:
         super().__init__(structures.so_far)
         self.structures = structures
-
-
-def check_restriction(
-    simulator: Simulator, trajectories: Trajectories, likelihood: Segments, restriction: Restriction
-) -> None:
-    """See before a search that sites exist, that extensions load, and that each of the user's own finds a place.
-
-    Args:
-        simulator: of the user's model.
-        trajectories: the logs.
-        likelihood: how they are cut into windows.
-        restriction: what is to be checked.
-
-    Raises:
-        ValueError: where it is not so; one line with the remedy.
-    """
-    _check_sites(_environment(simulator), restriction.sites)
-    own = [get_extension(name) for name in restriction.names if name not in EXTENSIONS]
-    if not own:
-        return
-    windows = BoundLikelihood(likelihood, simulator, trajectories)
-    machine = machine_of(windows, np.clip(simulator.space.default_theta, 0, 1), windows.no_starts())
-    for extension in own:
-        if not list(placements(extension, machine)):
-            raise ValueError(
-                f"structure: extension {extension.name!r} finds no {extension.kind} that it applies to in this model; "
-                "give its parameters targets that the model has, or leave it out"
-            )
-
-
-def _environment(simulator: Simulator) -> MjcfEnvironment:
-    environment = simulator.environment
-    if not isinstance(environment, MjcfEnvironment):
-        raise ValueError("simulator: structures are looked for in a user's MJCF; give a Simulator of one")
-    return environment
-
-
-def _search(
-    simulator: Simulator,
-    trajectories: Trajectories,
-    holdout: Trajectories | None,
-    prior: Posterior | None,
-    likelihood: Segments | None,
-    restriction: Restriction | None,
-    options: DiscoverOptions | None,
-    budget: int,
-    seed: int,
-    progress: Progress | None,
-) -> StructureSearch:
-    environment = _environment(simulator)
-    restriction, options = restriction or Restriction(), options or DiscoverOptions()
-    _check_sites(environment, restriction.sites)
-    columns = 1 + len(simulator.space) + len(environment.start_sd(simulator.model))
-    # a linearisation of the plain model takes a few seconds at most
-    seconds = min(options.physics_steps, 2.5e5 / columns) * float(simulator.model.opt.timestep)
-    extensions = [get_extension(name) for name in restriction.names]
-    memory = sum(extension.memory(float(trajectories.dt.max())) for extension in extensions)
-    late = {c: float(own) + memory for c, own in zip(environment.channels, environment.remembers, strict=True)}
-    fitting = Fitting(
-        environment,
-        trajectories,
-        holdout,
-        replace(likelihood or Segments(), noise="ar1", seconds=seconds, late=tuple(late.items())),
-        default_prior(environment.space) if prior is None else prior,
-        whole("seed", seed, 0),
-        simulator.num_threads or cores(),
-    )
-    if fitting.windows(simulator).impacts:
-        fitting = _between_contacts(fitting, simulator)
-    most = whole("budget", budget, 1, "rollouts", MOST_ROLLOUTS)
-    return StructureSearch(fitting, extensions, restriction.sites, options, most, progress)
 
 
 def _between_contacts(fitting: Fitting, simulator: Simulator) -> Fitting:
@@ -237,31 +218,3 @@ def _between_contacts(fitting: Fitting, simulator: Simulator) -> Fitting:
         likelihood=replace(fitting.likelihood, windows=tuple(short)),
         spans=True,
     )
-
-
-def _check_sites(environment: MjcfEnvironment, sites: Sequence[str] | None) -> None:
-    model = environment.compile()
-    known = [model.joint(j).name for j in range(model.njnt)]
-    known = [name for name in (*known, *environment.actuators, *environment.channels) if name]
-    for site in sites or ():
-        if site not in known:
-            hint = nearest_name(site, known) or f"; the model has {', '.join(known)}"
-            raise ValueError(f"structure.sites: no joint, actuator or channel {site!r}{hint}")
-
-
-def _fingerprint(search: StructureSearch, simulator: Simulator, restriction: Restriction) -> str:
-    """What tells searches apart."""
-    fitting = search.fitting
-    settings = {
-        "model": simulator.checksum(),
-        "space": fitting.environment.space.to_dict(),
-        "prior": [x.tolist() for x in fitting.prior.gaussian_moments()],
-        "likelihood": repr(fitting.likelihood),
-        "seed": fitting.seed,
-        "options": search.options.plain(),
-        "restriction": repr(restriction),
-        "extensions": list(EXTENSIONS),
-        "own": restriction.digests,
-    }
-    held_out = "" if fitting.holdout is None else digest(fitting.holdout)
-    return hashlib.sha256(f"{settings!r}{digest(fitting.trajectories)}{held_out}".encode()).hexdigest()

@@ -5,38 +5,24 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from sipe_bayes.core.arrays import FloatArray, IntArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.core.budget import BudgetTooSmall
-from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.inference.laplace import EVIDENCE_TUNING, Laplace
 from sipe_bayes.inference.recorded import Progress
-from sipe_bayes.likelihood import (
-    FLAT_PRECISION,
-    BoundLikelihood,
-    FitResult,
-    Linearisation,
-    Noise,
-    QuadraticPrior,
-    Segments,
-)
+from sipe_bayes.likelihood import FLAT_PRECISION, BoundLikelihood, Linearisation, Noise, QuadraticPrior, Segments
 from sipe_bayes.posterior import GaussianMixture, Posterior
 from sipe_bayes.posterior import prior as default_prior
 from sipe_bayes.simulation.simulator import Simulator
 from sipe_bayes.structure.extension import Placed, extended
 from sipe_bayes.structure.internal_starts import mapped_starts
-from sipe_bayes.structure.scores import Pieces, Scores, predictive, scores
-
-_STEPS = 40  # of a fit, which takes twenty to thirty
-_EDGE = 1e-3  # of the cube: at a bound
-_UNNEEDED = 10.0  # nats: an extension that explains nothing lowers the evidence by no more
-_FLAT_SD = 1e3  # of the cube: stands for a uniform prior beside a normal one
+from sipe_bayes.structure.scores import Pieces, predictive, scores
 
 
 @dataclass(frozen=True)
@@ -48,8 +34,7 @@ class FittedStructure:
         theta: (N + P,), the optimum: the user's parameters, then those of the extensions in this order.
         mean: (N + P,), of the posterior's normal before truncation.
         covariance: (N + P, N + P), likewise.
-        sd: (C,), of the noise.
-        tau: (C,), its correlation time in seconds.
+        noise: (C,), of the residuals.
         starts: (W, D), of the windows.
         evidence: log p(y) in nats.
         held: pieces that were held out.
@@ -61,8 +46,7 @@ class FittedStructure:
     theta: FloatArray
     mean: FloatArray
     covariance: FloatArray
-    sd: FloatArray
-    tau: FloatArray
+    noise: Noise
     starts: FloatArray
     evidence: float
     held: Pieces
@@ -72,15 +56,15 @@ class FittedStructure:
     @property
     def spanned(self) -> FloatArray:
         """The covariance (N + P, N + P), which reaches as far as an optimum beyond a sd: simulations are rough."""
-        inside = (self.theta > _EDGE) & (self.theta < 1 - _EDGE)
-        gap = np.where(inside, self.theta - self.mean, 0.0)
+        gap = np.where(_inside(self.theta), self.theta - self.mean, 0.0)
         far = np.abs(gap) > np.sqrt(np.diag(self.covariance))
         return self.covariance + np.outer(gap, gap) if far.any() else self.covariance
 
-    @property
-    def noise(self) -> Noise:
-        """Of the residuals."""
-        return Noise(self.sd, self.tau)
+    def columns(self, placed: Sequence[Placed]) -> dict[str, IntArray]:
+        """Where the parameters of each of its extensions are in theta, by label."""
+        counts = [len(piece.parameters) for piece in placed]
+        ends = len(self.theta) - sum(counts) + np.cumsum(counts)
+        return {x: np.arange(end - n, end) for x, end, n in zip(self.labels, ends, counts, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -115,9 +99,9 @@ class Fitting:
         return time.monotonic() > self.ends
 
     def enough(self, placed: Sequence[Placed]) -> int:
-        """Rollouts of as many steps of a fit as lead to its optimum."""
+        """Rollouts that a fit may have: those of forty steps (its optimum takes twenty to thirty), at least 2,000."""
         windows = self.windows(self.simulator(placed))
-        return _STEPS * (windows.num_theta + windows.num_start + 2) * len(self.trajectories)
+        return max(2000, 40 * (windows.num_theta + windows.num_start + 2) * len(self.trajectories))
 
     def simulator(self, placed: Sequence[Placed]) -> Simulator:
         """Of the model with extensions."""
@@ -129,7 +113,17 @@ class Fitting:
 
     def prior_of(self, simulator: Simulator) -> Posterior:
         """The user's prior beside those of the extensions."""
-        return beside(self.prior, simulator.space)
+        own, n = default_prior(simulator.space), len(self.prior.space)
+        given = [x.numpy() for x in self.prior.gaussian_moments()]
+        usual = default_prior(self.prior.space).gaussian_moments()
+        if len(simulator.space) == n:
+            return self.prior
+        if all(np.array_equal(a, b) for a, b in zip(usual, given, strict=True)):
+            return own
+        mean, covariance = (x.numpy().copy() for x in own.gaussian_moments())
+        covariance[np.isinf(covariance)] = 1e6  # a sd of 1,000 cubes stands for a uniform prior beside a normal one
+        mean[:n], covariance[:n, :n] = given
+        return GaussianMixture(torch.zeros(1), mean[None], covariance[None], simulator.space)
 
     def fit(
         self,
@@ -140,84 +134,71 @@ class Fitting:
         begin: FittedStructure | None = None,
         part: FittedStructure | None = None,
     ) -> FittedStructure:
-        """The best optimum of a structure, and its scores.
+        """The best optimum of a structure, and its scores, of ``budget`` rollouts at most.
 
-        A structure that fits worse than a part of it is at another local optimum; it is fitted again from the part's.
-
-        Args:
-            placed: its extensions.
-            initial: (N + P,), where the search begins; default as ``laplace`` does.
-            budget: rollouts at most.
-            progress: called along the way.
-            begin: the structure whose initial states the search begins with, if it has as many.
-            part: a structure with some of these extensions; none by default.
+        The search begins at ``initial`` (N + P,), by default as ``laplace`` does, and with the initial states of the
+        structure ``begin``, if it has as many. A structure that fits worse than ``part``, which has some of these
+        extensions, is at another local optimum; it is fitted again from the part's.
 
         Raises:
             BudgetTooSmall: where it ends before there is an optimum.
         """
         simulator = self.simulator(placed)
-        prior = self.prior_of(simulator)
-        windows = self.windows(simulator)
+        prior, windows = self.prior_of(simulator), self.windows(simulator)
         # what an extension's own states are nobody knows: then the search begins as one without an estimate does
-        known = begin is not None and begin.starts.shape[-1] == windows.num_start
-        begins: list[tuple[FloatArray | None, FloatArray | None]] = [
-            (initial, begin.starts if known and begin else None)
-        ]
-        begins += [] if part is None else [self._part_optimum(placed, simulator, part)]
-        rollouts, found = 0, list[tuple[Scores, FitResult]]()
+        starts = begin.starts if begin is not None and begin.starts.shape[-1] == windows.num_start else None
+        begins = [(initial, starts)] + ([] if part is None else [self._part_optimum(placed, simulator, part)])
+        rollouts, found = 0, list[FittedStructure]()
         for at in begins:
             left = budget - rollouts - windows.rollouts - self._scoring(windows)
             if found and left < rollouts:
                 break
-            laplace = self._laplace(simulator, prior, at, max(left, 1), progress)
+            laplace = Laplace(
+                simulator,
+                prior=prior,
+                budget=max(left, 1),
+                seed=self.seed,
+                likelihood=self.likelihood,
+                progress=progress,
+                initial=None if at[0] is None else at[0][None],
+                tuning=EVIDENCE_TUNING,
+            )
+            laplace.initial_starts, laplace.time_limit = at[1], max(self.ends - time.monotonic(), 0.0)
             try:
                 laplace.fit(self.trajectories)
-                assert laplace.result is not None
-                found.append((self._scores(windows, laplace.result, prior), laplace.result))
+                end = laplace.result
+                assert end is not None
+                assert end.starts is not None
+                score = scores(windows, end.theta, end.starts, end.noise, QuadraticPrior.of(prior))
+                labels, normal = tuple(one.label for one in placed), (end.theta, end.mean, end.covariance)
+                found.append(FittedStructure(labels, *normal, end.noise, end.starts, *score, 0, end.finding is None))
             except (BudgetTooSmall, ValueError):  # LinAlgError is one; what was found stands
                 if not found and (at is begins[-1] or left <= laplace.rollouts or self.is_late):
                     raise
             rollouts += laplace.rollouts
-            ahead = part is None or (found and found[-1][0].evidence >= part.evidence - _UNNEEDED)
+            ahead = part is None or (found and found[-1].evidence >= part.evidence - 10.0)  # nats
             if ahead or (found and self.is_late):
                 break
-        (evidence, pieces), best = max(found, key=lambda one: (one[1].finding is None, one[0].evidence))
-        assert best.starts is not None
+        best = max(found, key=lambda one: (one.settled, one.evidence))
         if self.holdout is not None:
             held = BoundLikelihood(self.likelihood, simulator, self.holdout)
-            pull = np.linalg.solve(best.covariance, best.mean - best.theta)
-            pull[(best.theta > _EDGE) & (best.theta < 1 - _EDGE)] = 0.0  # a step that was not taken is none
-            mean = best.theta + best.covariance @ pull
-            posterior = GaussianMixture(torch.zeros(1), mean[None], best.covariance[None], simulator.space)
-            own = predictive(held, best.theta, best.noise, QuadraticPrior.of(posterior))
-            pieces = pieces.beside(own, len(self.trajectories))
+            best = replace(best, held=best.held.beside(_held_out(held, best), len(self.trajectories)))
             windows.rollouts += held.rollouts
-        return FittedStructure(
-            tuple(one.label for one in placed),
-            best.theta,
-            best.mean,
-            best.covariance,
-            best.noise.sd,
-            best.noise.tau,
-            best.starts,
-            evidence,
-            pieces,
-            rollouts + windows.rollouts,
-            best.finding is None and (ahead or not self.is_late),  # else its part's optimum is still to be tried
-        )
+        settled = best.settled and bool(ahead or not self.is_late)  # else its part's optimum is still to be tried
+        return replace(best, rollouts=rollouts + windows.rollouts, settled=settled)
 
     def needs(self, placed: Sequence[Placed], one: FittedStructure) -> tuple[dict[str, float], int]:
         """By how many nats a structure would fit worse without each extension, and rollouts that were taken.
 
         All else follows to first order, from a simulation without it. Of one without parameters nothing is known: zero.
         """
-        windows = self.windows(self.simulator(placed))
+        windows, columns = self.windows(self.simulator(placed)), one.columns(placed)
         prior = QuadraticPrior.of(self.prior_of(windows.simulator))
-        lin, n, first = windows.linearise(one.theta, one.starts), windows.num_theta, len(self.prior.space)
+        lin, n = windows.linearise(one.theta, one.starts), windows.num_theta
 
         def square(residual: FloatArray, keep: IntArray) -> float:
-            columns = np.append(keep, np.arange(n, lin.jacobian.shape[-1]))
-            moments = windows.moments(Linearisation(residual, lin.jacobian[..., columns], True))
+            kept = np.append(keep, np.arange(n, lin.jacobian.shape[-1]))
+            moments = windows.moments(Linearisation(residual, lin.jacobian[..., kept], True))
             normal = moments.normal(one.noise)
             arrow = windows.eliminate(normal, len(keep), one.starts)
             belief = (prior.precision + FLAT_PRECISION * np.eye(n))[np.ix_(keep, keep)]
@@ -226,19 +207,12 @@ class Fitting:
 
         out, whole = dict[str, float](), square(lin.residual, np.arange(n))
         for piece in placed:
-            own = np.arange(first, first + len(piece.parameters))
-            first += len(own)
-            theta = one.theta.copy()
+            own, theta = columns[piece.label], one.theta.copy()
             theta[own] = piece.plain
             (residual,), (valid,) = windows.residuals(theta[None], one.starts[None])
             left = square(residual, np.setdiff1d(np.arange(n), own)) if valid else math.inf
             out[piece.label] = 0.5 * (left - whole) if len(own) else 0.0
         return out, windows.rollouts
-
-    @staticmethod
-    def _scores(windows: BoundLikelihood, best: FitResult, prior: Posterior) -> Scores:
-        assert best.starts is not None
-        return scores(windows, best.theta, best.starts, best.noise, QuadraticPrior.of(prior))
 
     def _scoring(self, windows: BoundLikelihood) -> int:
         """Rollouts that the scores of an optimum take."""
@@ -252,47 +226,21 @@ class Fitting:
         """Theta (N + P,) and starts (W, D) of a structure where a part of it ended: further extensions do nothing."""
         by_label = {one.label: one for one in placed}
         extensions = [by_label[label] for label in part.labels]
-        n = len(self.prior.space)
-        theta, first = {"": part.theta[:n]}, n
-        for one in extensions:
-            theta[one.label] = part.theta[first : first + len(one.parameters)]
-            first += len(one.parameters)
+        columns, n = part.columns(extensions), len(self.prior.space)
+        theta = [part.theta[columns[one.label]] if one.label in columns else one.plain for one in placed]
         starts = mapped_starts(self.simulator(extensions).model, simulator.model, part.starts)
-        return np.concatenate([theta[""], *(theta.get(one.label, one.plain) for one in placed)]), starts
-
-    def _laplace(
-        self,
-        simulator: Simulator,
-        prior: Posterior,
-        begin: tuple[FloatArray | None, FloatArray | None],
-        budget: int,
-        progress: Progress | None,
-    ) -> Laplace:
-        """What finds the optimum, beginning at theta (N + P,) and starts (W, D) where these are given."""
-        theta, starts = begin
-        laplace = Laplace(
-            simulator,
-            prior=prior,
-            budget=budget,
-            seed=self.seed,
-            likelihood=self.likelihood,
-            progress=progress,
-            initial=None if theta is None else theta[None],
-            tuning=EVIDENCE_TUNING,
-        )
-        laplace.initial_starts = starts
-        laplace.time_limit = max(self.ends - time.monotonic(), 0.0)
-        return laplace
+        return np.concatenate([part.theta[:n], *theta]), starts
 
 
-def beside(prior: Posterior, space: ParameterSpace) -> Posterior:
-    """The user's prior of the first parameters of a space, and the others' own."""
-    own, n = default_prior(space), len(prior.space)
-    mine = default_prior(prior.space)
-    same = zip(mine.gaussian_moments(), prior.gaussian_moments(), strict=True)
-    if len(space) == n or all(torch.equal(a, b) for a, b in same):
-        return own if len(space) > n else prior
-    mean, covariance = (x.numpy().copy() for x in own.gaussian_moments())
-    covariance[np.isinf(covariance)] = _FLAT_SD**2
-    mean[:n], covariance[:n, :n] = (x.numpy() for x in prior.gaussian_moments())
-    return GaussianMixture(torch.zeros(1), mean[None], covariance[None], space)
+def _held_out(windows: BoundLikelihood, best: FittedStructure) -> Pieces:
+    """Pieces of held-out logs under the posterior at an optimum, of which a step that was not taken is none."""
+    pull = np.linalg.solve(best.covariance, best.mean - best.theta)
+    pull[_inside(best.theta)] = 0.0
+    mean = best.theta + best.covariance @ pull
+    posterior = GaussianMixture(torch.zeros(1), mean[None], best.covariance[None], windows.simulator.space)
+    return predictive(windows, best.theta, best.noise, QuadraticPrior.of(posterior))
+
+
+def _inside(theta: FloatArray) -> BoolArray:
+    """Which parameters (N,) are not at a bound of the cube."""
+    return (theta > 1e-3) & (theta < 1 - 1e-3)

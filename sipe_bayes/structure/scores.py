@@ -16,12 +16,9 @@ pieces is the expected log predictive density by cross-validation (A. Vehtari, A
 Bayesian model evaluation", https://doi.org/10.1007/s11222-016-9696-4); it is what refitting gives where the model is
 linear around its optimum.
 
-Deviations:
-
-- The noise is that of the fit to all training logs. Pieces are compared as if noise began anew in each.
-- Directions that the data leave open get the flat normal of ``likelihood.quadratic_prior``.
-- g is the slope less what it was where the search ended, but at a bound: where simulations are rough, slopes promise
-  gains that the search did not find.
+Deviations: the noise is that of the fit to all training logs, and pieces are compared as if noise began anew in each;
+directions that the data leave open get the flat normal of ``likelihood.quadratic_prior``; g is the slope less what it
+was where the search ended, but at a bound: slopes of rough simulations promise gains that the search did not find.
 """
 
 from __future__ import annotations
@@ -34,10 +31,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
-from sipe_bayes.likelihood import FLAT_PRECISION, BoundLikelihood, Noise, QuadraticPrior, damped_box_step
+from sipe_bayes.likelihood import FLAT_PRECISION, BoundLikelihood, Linearisation, Noise, QuadraticPrior, damped_box_step
 from sipe_bayes.posterior.truncated_normal import TruncatedNormal
-
-_PIECES = 40  # of all logs together, at most
 
 
 @dataclass(frozen=True)
@@ -56,10 +51,9 @@ class Pieces:
 
     def beside(self, other: Pieces, first: int) -> Pieces:
         """These, and pieces of other logs, which are counted on from ``first``."""
+        density = np.concatenate([self.density, other.density])
         log = np.concatenate([self.log, other.log + first])
-        both = zip((self.density, self.square), (other.density, other.square), strict=True)
-        density, square = (np.concatenate(pair) for pair in both)
-        return Pieces(density, log, square)
+        return Pieces(density, log, np.concatenate([self.square, other.square]))
 
 
 class Scores(NamedTuple):
@@ -72,64 +66,47 @@ class Scores(NamedTuple):
 def scores(
     windows: BoundLikelihood, theta: FloatArray, starts: FloatArray, noise: Noise, prior: QuadraticPrior
 ) -> Scores:
-    """Both scores of an optimum; costs a linearisation.
-
-    Args:
-        windows: the logs, W windows.
-        theta: (N,), the optimum.
-        starts: (W, D), there.
-        noise: (C,), there.
-        prior: of theta.
+    """Both scores of an optimum: theta (N,), starts (W, D) of the windows, noise (C,); costs a linearisation.
 
     Raises:
         ValueError: where the simulation diverges.
     """
-    linearisation = windows.linearise(theta, starts)
-    if not linearisation.valid:
+    lin = windows.linearise(theta, starts)
+    if not lin.valid:
         raise ValueError("theta: the simulation diverges at the optimum")
-    products, constants = windows.moments(linearisation).normal(noise), _log_determinants(windows, noise)
-    linear = _Linear(windows, theta, starts, prior)
+    linear, parts = _Linear(windows, theta, starts, prior), _parts(windows)
+    products, constants = linear.whitened(lin, noise)
     linear = replace(linear, untaken=linear.step(products))
-    evidence = linear.evidence(linear.centred(products), float(constants.sum()))
-    parts = _parts(windows)
+    evidence = linear.evidence(linear.centred(products), constants)
     if len(parts) < 2 or len(products) < len(windows.log):
-        one = [np.ones(windows.num_windows, bool)]
-        return Scores(evidence, _pieces(windows, one, np.array([evidence]), constants))
-    windows = windows.cut(np.array([part.argmax() for part in parts]))
-    products, constants = windows.moments(linearisation).normal(noise), _log_determinants(windows, noise)
-    linear, products = replace(linear, windows=windows), linear.centred(products)
-    every = linear.evidence(products, float(constants.sum()))
-    without = [linear.evidence_of(products, constants, ~part) for part in parts]
-    return Scores(evidence, _pieces(windows, parts, every - np.array(without), constants))
+        return Scores(evidence, _pieces(windows, [np.ones(windows.num_windows, bool)], [evidence], constants))
+    linear = linear.cut(parts)
+    products, constants = linear.whitened(lin, noise)
+    products = linear.centred(products)
+    every = linear.evidence(products, constants)
+    density = [every - linear.evidence(products, constants, ~part) for part in parts]
+    return Scores(evidence, _pieces(linear.windows, parts, density, constants))
 
 
 def predictive(windows: BoundLikelihood, theta: FloatArray, noise: Noise, posterior: QuadraticPrior) -> Pieces:
-    """Pieces of held-out logs; minus infinity where a simulation diverges; costs two linearisations and more.
+    """Pieces of held-out logs by the posterior of theta (N,), given the training logs; two linearisations and more.
 
-    The starts are those that fit best; the noise is that of the held-out logs themselves, since a model's error differs
-    from motion to motion.
-
-    Args:
-        windows: the held-out logs.
-        theta: (N,), the optimum.
-        noise: (C,), there, at which the estimate of the held-out logs' begins.
-        posterior: of theta, given the training logs.
+    The starts are those that fit best. The noise is that of the held-out logs themselves, since a model's error differs
+    from motion to motion; its estimate begins at ``noise`` (C,).
     """
-    parts = _parts(windows) if windows.num_start else [np.ones(windows.num_windows, bool)]  # known starts: one block
     starts = windows.fit_starts(theta, noise)[0] if windows.num_start else windows.no_starts()
-    linearisation = windows.linearise(theta, starts)
-    if not linearisation.valid:
-        lost = np.full(len(parts), -np.inf)
-        return Pieces(lost, np.array([windows.log[part][0] for part in parts]), np.ones(len(parts)))
+    parts = _parts(windows) if windows.num_start else [np.ones(windows.num_windows, bool)]  # known starts: one block
+    lin = windows.linearise(theta, starts)
+    if not lin.valid:
+        log = np.array([windows.log[part][0] for part in parts])
+        return Pieces(np.full(len(parts), -np.inf), log, np.ones(len(parts)))
     pulls = windows.pulls(posterior.precision, posterior.pull(theta), starts)
-    noise = windows.estimate_noise(windows.moments(linearisation), noise, pulls, True)
-    windows = windows.cut(np.array([part.argmax() for part in parts]))
-    products, constants = windows.moments(linearisation).normal(noise), _log_determinants(windows, noise)
-    linear = _Linear(windows, theta, starts, posterior)
-    if not windows.num_start:
-        return _pieces(windows, parts, np.array([linear.evidence(products, float(constants.sum()))]), constants)
-    density = np.array([linear.evidence_of(products, constants, part) for part in parts])
-    return _pieces(windows, parts, density, constants)
+    noise = windows.estimate_noise(windows.moments(lin), noise, pulls, True)
+    linear = _Linear(windows, theta, starts, posterior).cut(parts)
+    products, constants = linear.whitened(lin, noise)
+    # without starts products are of all windows together
+    density = [linear.evidence(products, constants, part if windows.num_start else None) for part in parts]
+    return _pieces(linear.windows, parts, density, constants)
 
 
 @dataclass(frozen=True)
@@ -145,10 +122,21 @@ class _Linear:
     prior: QuadraticPrior
     untaken: tuple[FloatArray, FloatArray] | None = None
 
+    def cut(self, parts: list[BoolArray]) -> _Linear:
+        """The same with windows cut where each piece begins."""
+        return replace(self, windows=self.windows.cut(np.array([part.argmax() for part in parts])))
+
+    def whitened(self, lin: Linearisation, noise: Noise) -> tuple[FloatArray, FloatArray]:
+        """Whitened products (W, K, K) of the windows' rows, and log|2 pi V| (W,) of these."""
+        out = np.zeros(self.windows.num_windows)
+        for s, sd, tau in zip(self.windows.sequences, noise.sd.tolist(), noise.tau.tolist(), strict=True):
+            each = np.log(2 * np.pi * sd**2 * (1 - s.coefficients(tau) ** 2))
+            out += np.bincount(s.window, each, minlength=len(out))
+        return self.windows.moments(lin).normal(noise), out
+
     def centred(self, products: FloatArray) -> FloatArray:
         """Whitened products (W, K, K) by which the optimum within the cube is where the search ended."""
-        if self.untaken is None:
-            return products
+        assert self.untaken is not None
         n, d, (move, own) = len(self.theta), self.windows.num_start, self.untaken
         step, change = np.tile(move, (len(products), 1)), np.zeros((len(products), n + 2 * d))
         if d:  # else products are of all windows together
@@ -165,39 +153,33 @@ class _Linear:
         solved = self.windows.eliminate(products, len(self.theta), self.starts)
         move = np.zeros(len(self.theta))
         if len(move):
-            move = damped_box_step(solved.precision + self._inner, solved.gradient + self._pull, self.theta, 0.0)
+            precision, pull = self._belief
+            move = damped_box_step(solved.precision + precision, solved.gradient + pull, self.theta, 0.0)
         return move, solved.blocks(move)
 
     @property
-    def _inner(self) -> FloatArray:
-        """Precision (N, N) of the prior, with directions closed."""
-        return self.prior.precision + FLAT_PRECISION * np.eye(len(self.theta))
-
-    @property
-    def _pull(self) -> FloatArray:
-        """Of the prior (N,)."""
+    def _belief(self) -> tuple[FloatArray, FloatArray]:
+        """Precision (N, N) and pull (N,) of the prior, with open directions closed."""
+        precision = self.prior.precision + FLAT_PRECISION * np.eye(len(self.theta))
         pull = self.prior.pull(self.theta) + FLAT_PRECISION * (0.5 - self.theta)
-        return pull if self.untaken is None else pull - self._inner @ self.untaken[0]
+        return precision, pull if self.untaken is None else pull - precision @ self.untaken[0]
 
-    def evidence_of(self, products: FloatArray, constants: FloatArray, which: BoolArray) -> float:
-        """Log p of the rows of some windows (W,) alone."""
-        return self.evidence(np.where(which[:, None, None], products, 0.0), float(constants[which].sum()))
-
-    def evidence(self, products: FloatArray, constant: float) -> float:
-        """Log p of the rows behind whitened products (W, K, K); constant: their log|2 pi V|."""
-        n, precision = len(self.theta), self.windows.start_precision
+    def evidence(self, products: FloatArray, constants: FloatArray, which: BoolArray | None = None) -> float:
+        """Log p of the rows behind whitened products (W, K, K), with log|2 pi V| (W,); of some windows (W,) alone."""
+        if which is not None:
+            products, constants = np.where(which[:, None, None], products, 0.0), constants[which]
+        n, start_precision = len(self.theta), self.windows.start_precision
         solved = self.windows.eliminate(products, n, self.starts)
-        starts = float((self.starts**2 @ precision).sum()) - solved.explained + solved.log_determinant
-        starts -= len(self.starts) * float(np.log(precision).sum())
-        level = -0.5 * (constant + float(products[:, -1, -1].sum()) + starts) - self.prior.energy(self.theta)
-        precision = solved.precision + self._inner
-        gradient = solved.gradient + self._pull
+        starts = float((self.starts**2 @ start_precision).sum()) - solved.explained + solved.log_determinant
+        starts -= len(self.starts) * float(np.log(start_precision).sum())
+        square = float(constants.sum()) + float(products[:, -1, -1].sum()) + starts
+        precision, gradient = (x + y for x, y in zip((solved.precision, solved.gradient), self._belief, strict=True))
         covariance = np.linalg.inv(0.5 * (precision + precision.T))
         step = covariance @ gradient
-        log_det = float(np.linalg.slogdet(precision)[1])
-        mass = _log_mass(self.theta + step, 0.5 * (covariance + covariance.T))
-        around = 0.5 * float(gradient @ step) - 0.5 * log_det + 0.5 * n * float(np.log(2 * np.pi)) + mass
-        return level + around - self._log_prior_integral
+        around = 0.5 * float(gradient @ step) - 0.5 * float(np.linalg.slogdet(precision)[1])
+        around += 0.5 * n * float(np.log(2 * np.pi))
+        around += _log_mass(self.theta + step, 0.5 * (covariance + covariance.T))
+        return -0.5 * square - self.prior.energy(self.theta) + around - self._log_prior_integral
 
     @functools.cached_property
     def _log_prior_integral(self) -> float:
@@ -224,26 +206,19 @@ def _log_mass(mean: FloatArray, covariance: FloatArray) -> float:
     return within.log_mass
 
 
-def _log_determinants(windows: BoundLikelihood, noise: Noise) -> FloatArray:
-    """Of each window (W,) its rows' log|2 pi V|."""
-    out = np.zeros(windows.num_windows)
-    for s, sd, tau in zip(windows.sequences, noise.sd.tolist(), noise.tau.tolist(), strict=True):
-        out += np.bincount(s.window, np.log(2 * np.pi * sd**2 * (1 - s.coefficients(tau) ** 2)), minlength=len(out))
-    return out
-
-
 def _parts(windows: BoundLikelihood) -> list[BoolArray]:
     """Which windows (W,) each piece has: adjacent ones of one log, those without samples left out."""
     numbers = np.flatnonzero(windows.observed.any((1, 2)))
-    log = windows.log[numbers]
-    most = max(_PIECES // max(len(np.unique(log)), 1), 1)
-    split = [np.array_split(own, min(most, len(own))) for own in (numbers[log == k] for k in np.unique(log))]
-    return [np.isin(np.arange(windows.num_windows), part) for parts in split for part in parts]
+    logs = np.unique(windows.log[numbers])
+    most = max(40 // max(len(logs), 1), 1)  # forty pieces of all logs together
+    own = [numbers[windows.log[numbers] == log] for log in logs]
+    split = [part for each in own for part in np.array_split(each, min(most, len(each)))]
+    return [np.isin(np.arange(windows.num_windows), part) for part in split]
 
 
-def _pieces(windows: BoundLikelihood, parts: list[BoolArray], density: FloatArray, constants: FloatArray) -> Pieces:
+def _pieces(windows: BoundLikelihood, parts: list[BoolArray], densities: list[float], constants: FloatArray) -> Pieces:
     """Pieces of densities (K,) whose windows have rows' log|2 pi V| (W,)."""
-    samples = windows.observed.sum((1, 2))
+    samples, density = windows.observed.sum((1, 2)), np.array(densities)
     count = np.array([max(samples[part].sum(), 1) for part in parts])
     square = (-2 * density - np.array([constants[part].sum() for part in parts])) / count
     return Pieces(density, np.array([windows.log[part][0] for part in parts], np.int64), square)

@@ -1,6 +1,6 @@
 r"""The search over structures: what fits best is extended, round by round; then extensions are left out one by one.
 
-**Steps** (``StructureSearch``), one of them a call of ``step``::
+**Steps** (``StructureSearch.step``)::
 
     PLAIN   the model as it is; fitted again, and the search repeated, where an extension gains far more than predicted
       v
@@ -11,11 +11,6 @@ r"""The search over structures: what fits best is extended, round by round; then
       |  some are clearly better                  v
       +--> RANK, with these as the beam         DONE
          none is: PRUNE
-
-**Judgement** is ``comparison``'s alone: a structure is extended where it predicts pieces that it has not seen clearly
-better than all that it contains, and is not clearly behind the best one. For a single extension one standard error is
-enough: an effect may be clear only beside another. An extension is fitted from a predicted gain of five nats on: one
-that gains less than eight in the end is never clear of its own standard error.
 """
 
 from __future__ import annotations
@@ -34,79 +29,74 @@ from sipe_bayes.inference.recorded import Progress
 from sipe_bayes.likelihood import BoundLikelihood, QuadraticPrior
 from sipe_bayes.structure.augmented import AugmentedModel, DivergesError
 from sipe_bayes.structure.candidates import Candidate, rank_candidates
-from sipe_bayes.structure.comparison import choose_ties, difference, rank
+from sipe_bayes.structure.comparison import choose_ties, difference, parts_of, rank
 from sipe_bayes.structure.extension import Extension, Placed, members, placements
 from sipe_bayes.structure.fitted import FittedStructure, Fitting
-from sipe_bayes.structure.machine import Machine, machine_of
+from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
-from sipe_bayes.structure.state import BUDGET, DiscoverOptions, DiscoverState, Offer, Phase
+from sipe_bayes.structure.state import BUDGET, DiscoverState, Labels, Offer, Phase
 
 
 class StructureSearch:
-    """A search over structures, step by step.
+    """A search over structures with some extensions, of ``budget`` rollouts, step by step.
 
-    Args:
-        fitting: what structures are fitted to.
-        extensions: that may be used.
-        joints: names of joints, actuators and channels at which they may be placed; default all.
-        options: of the search.
-        budget: rollouts at most.
-        progress: called along the way.
+    ``sites`` are the joints, actuators and channels at which extensions may be placed, by default all; ``placed`` are
+    these extensions by label, once the plain model is fitted. ``ended`` says what ends a search that is cut short: its
+    "budget", its "time", or that it was "interrupted".
     """
+
+    width = 3  # structures that are fitted in a round; in the first up to twice as many
+    beam = 2  # structures that a round extends
+    most = 5  # extensions of a structure
+    least_gain = 5.0  # predicted nats from which an extension is fitted: below eight it is never clear of its error
+    plain_share = 0.5  # of the budget, for the model as it is at most
 
     def __init__(
         self,
         fitting: Fitting,
         extensions: Sequence[Extension],
-        joints: Sequence[str] | None = None,
-        options: DiscoverOptions | None = None,
+        sites: Sequence[str] | None = None,
         budget: int = BUDGET,
         progress: Progress | None = None,
     ) -> None:
-        self.fitting = fitting
-        self.extensions, self.joints = tuple(extensions), joints
-        self.options, self.budget, self.progress = options or DiscoverOptions(), budget, progress
+        self.fitting, self.extensions, self.sites = fitting, tuple(extensions), sites
+        self.budget, self.progress, self.ended = budget, progress, "budget"
+        self.placed: dict[str, Placed] = {}
         self._rollouts, self._fit_rollouts, self._doing = 0, 0, ""  # before the present fit, of it, and what it is for
-        self.ended = "budget"  # what ends a search that is cut short: that, "time", or "interrupted"
         self._longest = 0.0  # seconds of a fit of a structure that is not slow
-        self._machine: Machine | None = None
-        self._placed: dict[str, Placed] = {}
-        self._linear: dict[tuple[tuple[str, ...], bytes], AugmentedModel] = {}  # by labels and optimum
+        self._linear: dict[tuple[Labels, bytes], AugmentedModel] = {}  # by labels and optimum
 
     def step(self, state: DiscoverState) -> DiscoverState:
         """One fit or one ranking further."""
-        if state.fitted and state.placed_at is None:
-            state = replace(state, placed_at=(state.fitted[0].theta, state.fitted[0].starts))
-        self.place(state)
-        self._rollouts, self._fit_rollouts = state.rollouts, 0
-        self._doing = state.describe(len(self._placed))
+        state = self.place(state)
+        self._rollouts, self._fit_rollouts, self._doing = state.rollouts, 0, state.describe(len(self.placed))
         self._tell("")
-        late = self.is_late or self._ends_late(state)
-        if state.phase is not Phase.PLAIN and state.fitted and (late or state.rollouts >= self.budget):
-            self.ended = "time" if late else self.ended
-            return replace(state, phase=Phase.DONE, cut=state.cut if state.done else state.phase)
-        state = {
-            Phase.PLAIN: self._plain,
-            Phase.RANK: self._rank,
-            Phase.FIT: self._fit,
-            Phase.PRUNE: self._prune,
-            Phase.DONE: lambda state: state,
-        }[state.phase](state)
+        if state.phase is not Phase.PLAIN:
+            needed = self._longest * self._slowness(state.queue[0]) if state.phase is Phase.FIT else 0.0
+            late = time.monotonic() + needed > self.fitting.ends
+            if late or state.rollouts >= self.budget:
+                self.ended = "time" if late else self.ended
+                return replace(state, phase=Phase.DONE, cut=state.phase)
+        steps = {Phase.PLAIN: self._plain, Phase.RANK: self._rank, Phase.FIT: self._fit, Phase.PRUNE: self._prune}
+        state = steps[state.phase](state)
         if state.cut is None:
             return state
-        self.ended = "time" if self.is_late else self.ended
+        self.ended = "time" if self.fitting.is_late else self.ended
         return replace(state, phase=Phase.DONE)
 
-    @property
-    def is_late(self) -> bool:
-        """Whether the time limit has passed."""
-        return self.fitting.is_late
-
-    def _ends_late(self, state: DiscoverState) -> bool:
-        """Whether the next fit would end after the time limit, if it takes as long as the longest one until now."""
-        if state.phase is not Phase.FIT:
-            return False
-        return time.monotonic() + self._longest * self._slowness(state.queue[0]) > self.fitting.ends
+    def place(self, state: DiscoverState) -> DiscoverState:
+        """Place the extensions, once the plain model is fitted; the state says by which motion."""
+        if state.fitted and state.placed_at is None:
+            state = replace(state, placed_at=(state.fitted[0].theta, state.fitted[0].starts))
+        if state.placed_at is not None and not self.placed:
+            machine = machine_of(self.fitting.windows(self.fitting.simulator([])), *state.placed_at)
+            every = [piece for extension in self.extensions for piece in placements(extension, machine)]
+            if self.fitting.spans:
+                every = [piece for piece in every if all(p.log is None for p in piece.parameters)]
+            if self.sites is not None:
+                every = [piece for piece in every if set(members(piece.site)) <= set(self.sites)]
+            self.placed = {piece.label: piece for piece in every}
+        return state
 
     def _tell(self, what: str, rollouts: int = 0, _: int = 0) -> None:
         """How far the present step is, after some rollouts of a fit of its own; fewer are those of its next fit."""
@@ -120,7 +110,11 @@ class StructureSearch:
     def is_restricted(self) -> bool:
         """Whether some of the usual extensions may not be tried, or not everywhere."""
         usual = {name for name in EXTENSIONS if not get_extension(name).by_name}
-        return self.joints is not None or not usual <= {extension.name for extension in self.extensions}
+        return self.sites is not None or not usual <= {extension.name for extension in self.extensions}
+
+    def structure(self, labels: Sequence[str]) -> list[Placed]:
+        """The extensions of a structure."""
+        return [self.placed[label] for label in labels]
 
     def linear_model(
         self, one: FittedStructure, tell: Tell = silent, windows: BoundLikelihood | None = None
@@ -130,112 +124,63 @@ class StructureSearch:
         Raises:
             DivergesError: where its simulation does.
         """
-        key, own = (one.labels, one.theta.tobytes()), self.structure(one.labels)
-        if key not in self._linear:
-            simulator, lin = self.fitting.simulator(own), None
-            whole = windows = self.fitting.windows(simulator) if windows is None else windows
-            if self._slowness(one.labels) > 1:  # its residuals, beside what columns do without it
-                (residual,), _ = windows.residuals(one.theta[None], one.starts[None])
-                quick = self.fitting.windows(self.fitting.simulator([p for p in own if p.extension.slow == 1]))
-                quick.rollouts, quick.budget, quick.deadline = windows.rollouts, windows.budget, windows.deadline
-                lin = replace(quick.linearise(one.theta, one.starts), residual=residual)
-                whole.rollouts = quick.rollouts
-                windows, lin = (quick, lin) if lin.valid else (whole, None)
-            taken = {*one.labels, *(t for p in own for q in p.parameters for t in q.targets)}
-            every = self._placed.values()
-            rest = [p for p in every if not taken & {p.label, *(t for q in p.parameters for t in q.targets)}]
-            prior = QuadraticPrior.of(self.fitting.prior_of(simulator))
-            at = one.theta, one.noise, one.starts, prior
-            try:
-                self._linear[key] = AugmentedModel(windows, *at, lin, tell=tell, placed=rest)
-            finally:
-                whole.rollouts = windows.rollouts
-        return self._linear[key]
+        key, pieces = (one.labels, one.theta.tobytes()), self.structure(one.labels)
+        if key in self._linear:
+            return self._linear[key]
+        simulator, lin = self.fitting.simulator(pieces), None
+        whole = windows = self.fitting.windows(simulator) if windows is None else windows
+        if self._slowness(one.labels) > 1:  # its residuals, beside what columns do without it
+            (residual,), _ = windows.residuals(one.theta[None], one.starts[None])
+            quick = self.fitting.windows(self.fitting.simulator([p for p in pieces if p.extension.slow == 1]))
+            quick.rollouts, quick.budget, quick.deadline = windows.rollouts, windows.budget, windows.deadline
+            lin = replace(quick.linearise(one.theta, one.starts), residual=residual)
+            whole.rollouts = quick.rollouts
+            windows, lin = (quick, lin) if lin.valid else (whole, None)
+        taken = {target for piece in pieces for target in _writes(piece)}
+        rest = [piece for piece in self.placed.values() if not taken & _writes(piece)]
+        prior = QuadraticPrior.of(self.fitting.prior_of(simulator))
+        try:
+            model = AugmentedModel(windows, one.theta, one.noise, one.starts, prior, lin, tell=tell, placed=rest)
+        finally:
+            whole.rollouts = windows.rollouts
+        self._linear[key] = model
+        return model
 
-    @property
-    def placed(self) -> dict[str, Placed]:
-        """The extensions wherever the machine has a place for them, after the first step."""
-        return self._placed
-
-    def supported(self, state: DiscoverState, refused: Sequence[tuple[str, ...]] = ()) -> list[FittedStructure]:
+    def supported(self, state: DiscoverState, refused: Sequence[Labels] = ()) -> list[FittedStructure]:
         """The set that the logs support: ties, the simplest one first, of native elements where these do as well.
 
         refused: labels of structures that are not to be in it.
         """
 
         def simple(one: FittedStructure) -> tuple[int, bool, float]:
-            native = all(self._placed[label].extension.native for label in one.labels)
+            native = all(piece.extension.native for piece in self.structure(one.labels))
             return len(one.labels), not native, -rank(one)[1]
 
         return sorted(choose_ties([one for one in self._counted(state) if one.labels not in refused]), key=simple)
 
     def _counted(self, state: DiscoverState) -> list[FittedStructure]:
         """Those fitted to the end that predict held-out logs not worse than the plain model by a standard error."""
-        held = len(self.fitting.trajectories)
-        worse = [(gain := difference(state.fitted[0], one, held)).nats > gain.error for one in state.fitted]
-        return [one for one, bad in zip(state.fitted, worse, strict=True) if one.labels != state.cut_off and not bad]
-
-    def enough(self, labels: Sequence[str]) -> int:
-        """Rollouts that the fit of a structure may have."""
-        return max(self.options.fit_budget, self.fitting.enough(self.structure(labels)))
-
-    def structure(self, labels: Sequence[str]) -> list[Placed]:
-        """The extensions of a structure."""
-        return [self._placed[label] for label in labels]
-
-    def place(self, state: DiscoverState) -> None:
-        """Place the extensions, once the plain model is fitted."""
-        if self._placed or not state.fitted:
-            return
-        windows = self.fitting.windows(self.fitting.simulator([]))
-        self._machine = machine_of(windows, *(state.placed_at or (state.fitted[0].theta, state.fitted[0].starts)))
-        every = (p for e in self.extensions for p in placements(e, self._machine))
-        if self.fitting.spans:
-            every = (p for p in every if all(parameter.log is None for parameter in p.parameters))
-        allowed = None if self.joints is None else set(self.joints)
-        self._placed = {p.label: p for p in every if allowed is None or allowed.issuperset(members(p.site))}
+        held, counted = len(self.fitting.trajectories), []
+        for one in state.fitted:
+            loss = difference(state.fitted[0], one, since=held)
+            if one.labels != state.cut_off and loss.nats <= loss.error:
+                counted.append(one)
+        return counted
 
     def _plain(self, state: DiscoverState) -> DiscoverState:
-        """The nominal model fitted."""
-        budget = min(self.enough([]), int(self.options.plain_share * self.budget))
+        """The nominal model fitted, without a time limit."""
+        budget = min(self.fitting.enough([]), int(self.plain_share * self.budget))
         plain = replace(self.fitting, ends=math.inf).fit([], None, max(budget, 1), self._tell)
         return replace(state, fitted=(plain,), phase=Phase.RANK)
 
     def _rank(self, state: DiscoverState) -> DiscoverState:
         """Predicted gains beside one structure of the beam; or which structures are to be fitted."""
         for labels in state.beam:
-            if labels not in state.ranked and len(labels) < self.options.most:
-                here = state.of(labels)
-                assert here is not None
+            here = state.of(labels)
+            if here is not None and labels not in state.ranked and len(labels) < self.most:
                 return self._ranked(state, here)
         queue = self._queue(state)
         return replace(state, queue=queue, phase=Phase.FIT if queue else Phase.PRUNE)
-
-    def _queue(self, state: DiscoverState) -> tuple[tuple[str, ...], ...]:
-        """The structures with the largest predicted gains, beside what their part gains already; no tried ones.
-
-        Beside the model as it is, as many again with a quarter of the best one's: far from the truth these are
-        rough.
-        """
-        options, plain, queue = self.options, state.fitted[0], dict[frozenset[str], tuple[float, tuple[str, ...]]]()
-        for labels in state.beam:
-            here = state.of(labels)
-            before = 0.0 if here is None else rank(here)[1] - rank(plain)[1]
-            own = {offer.label: offer for offer in state.offers if offer.at == labels}  # the last of each
-            for offer in own.values():
-                grown = (*labels, offer.label)
-                if offer.gain > options.least_gain and not state.is_tried(grown):
-                    queue.setdefault(frozenset(grown), (before + offer.gain, grown))
-        ranked = sorted(queue.values(), key=lambda item: -item[0])
-        best = ranked[0][0] if ranked else 0.0
-        most = 2 * options.width if state.beam == ((),) else options.width
-        close = [(gain, grown) for gain, grown in ranked[options.width : most] if gain >= best / 4]
-        chosen = [grown for _, grown in ranked[: options.width] + close]
-        return tuple(sorted(chosen, key=self._slowness))  # more is known where the time ends within a round
-
-    def _slowness(self, labels: Sequence[str]) -> int:
-        """How many times as long as another one's a simulation of a structure takes."""
-        return max((one.extension.slow for one in self.structure(labels)), default=1)
 
     def _ranked(self, state: DiscoverState, here: FittedStructure) -> DiscoverState:
         """The state with predicted gains beside a structure, best first; cut where the budget ends."""
@@ -246,13 +191,36 @@ class StructureSearch:
         except BudgetExhausted:
             cut = state.phase
         except (DivergesError, np.linalg.LinAlgError):  # nothing can be predicted
-            ranked = []
+            pass
         offers = tuple(Offer(here.labels, c.placed.label, c.gain, c.theta, c.others) for c in ranked)
         ranks = state.rank_rollouts + windows.rollouts
         done = (*state.ranked, here.labels) if cut is None else state.ranked
         return replace(state, offers=state.offers + offers, ranked=done, rank_rollouts=ranks, cut=cut)
 
+    def _queue(self, state: DiscoverState) -> tuple[Labels, ...]:
+        """The structures with the largest predicted gains, beside what their part gains already; no tried ones.
+
+        Beside the model as it is, as many again with a quarter of the best one's: far from the truth these are
+        rough.
+        """
+        queue, at = dict[frozenset[str], tuple[float, Labels]](), {one.labels: rank(one)[1] for one in state.fitted}
+        for labels in state.beam:
+            last = {offer.label: offer for offer in state.offers if offer.at == labels}
+            for offer in last.values():
+                grown = (*labels, offer.label)
+                if offer.gain > self.least_gain and not state.is_tried(grown):
+                    queue.setdefault(frozenset(grown), (at[labels] - at[()] + offer.gain, grown))
+        ranked = sorted(queue.values(), key=lambda item: -item[0])
+        close = [item for item in ranked[self.width : 2 * self.width] if item[0] >= ranked[0][0] / 4]
+        chosen = ranked[: self.width] + (close if state.beam == ((),) else [])
+        return tuple(sorted((grown for _, grown in chosen), key=self._slowness))  # slow ones where time is left
+
+    def _slowness(self, labels: Sequence[str]) -> int:
+        """How many times as long as another one's a simulation of a structure takes."""
+        return max((piece.extension.slow for piece in self.structure(labels)), default=1)
+
     def _fit(self, state: DiscoverState) -> DiscoverState:
+        """The next structure of the queue fitted; behind the last one, the beam of the next round."""
         labels, *rest = state.queue
         offer = next(o for o in reversed(state.offers) if (*o.at, o.label) == labels)
         state = self._fitted(state, labels, np.concatenate([offer.others, offer.theta]), state.of(offer.at))
@@ -276,22 +244,26 @@ class StructureSearch:
         """
         before, state = state.fitted[0], self._without(state, one, ())
         plain = state.fitted[0]
-        if state.cut is not None or plain.evidence < before.evidence + self.options.least_gain:
+        if state.cut is not None or plain.evidence < before.evidence + self.least_gain:
             return state
-        self._placed, spent = {}, sum(other.rollouts for other in state.fitted[1:])
+        self.placed, spent = {}, sum(other.rollouts for other in state.fitted[1:])
         anew = DiscoverState(Phase.RANK, (plain,), pruned=((),), budget=state.budget)
         return replace(anew, rank_rollouts=state.rank_rollouts, failed_rollouts=state.failed_rollouts + spent)
 
-    def _next_beam(self, state: DiscoverState) -> tuple[tuple[str, ...], ...]:
-        """Labels of the best new structures that are clearly better than what they contain, and not clearly behind."""
+    def _next_beam(self, state: DiscoverState) -> tuple[Labels, ...]:
+        """Labels of the best new structures that are clearly better than what they contain, and not clearly behind.
+
+        For a single extension one standard error is enough: an effect may be clear only beside another.
+        """
+
+        def is_better(one: FittedStructure, part: FittedStructure) -> bool:
+            gain = difference(one, part)
+            return gain.nats > (1.0 if len(one.labels) == 1 else 2.0) * gain.error
+
         best = max(state.fitted, key=rank)
         new = [one for one in state.fitted if one.labels not in state.ranked and not difference(best, one).clear]
-        better = [
-            one
-            for one in new
-            if all(_is_better(one, part) for part in state.fitted if set(part.labels) < set(one.labels))
-        ]
-        return tuple(one.labels for one in sorted(better, key=rank, reverse=True)[: self.options.beam])
+        better = [one for one in new if all(is_better(one, part) for part in parts_of(one.labels, state.fitted))]
+        return tuple(one.labels for one in sorted(better, key=rank, reverse=True)[: self.beam])
 
     def _prune(self, state: DiscoverState) -> DiscoverState:
         """The best structure without the extension that it needs least, from where it ended; until one is needed."""
@@ -309,59 +281,50 @@ class StructureSearch:
                 break
         return replace(state, phase=Phase.DONE)
 
-    def _without(self, state: DiscoverState, one: FittedStructure, labels: tuple[str, ...]) -> DiscoverState:
-        """With a structure that has only those ``labels`` of another one, fitted from where that one ended."""
-        keep = [i for i, label in enumerate(self._owners(one)) if label in (None, *labels)]
-        before, failed = state.of(labels), state.failed
-        state = self._fitted(state, labels, one.theta[keep], one)
-        if before is not None:  # a failure says nothing then
-            state = replace(state, fitted=_merged(state.fitted, before), failed=failed, cut_off=None)
-        return replace(state, pruned=(*state.pruned, labels))
+    def _without(self, state: DiscoverState, one: FittedStructure, labels: Labels) -> DiscoverState:
+        """With a structure that has only those ``labels`` of another one, fitted from where that one ended.
 
-    def _owners(self, one: FittedStructure) -> list[str | None]:
-        """Whose each parameter of a structure is: None for the user's own."""
-        count = len(one.theta) - sum(len(self._placed[label].parameters) for label in one.labels)
-        own: list[str | None] = [None] * count
-        return own + [label for label in one.labels for _ in self._placed[label].parameters]
+        Of two fits of a structure the better one stays, in the place of the first.
+        """
+        own = one.columns(self.structure(one.labels))
+        left_out = np.concatenate([own[label] for label in one.labels if label not in labels])
+        before, after = state.of(labels), self._fitted(state, labels, np.delete(one.theta, left_out), one)
+        if before is not None:  # a failure says nothing then
+            fitted = state.fitted
+            if len(after.fitted) > len(fitted):
+                again = after.fitted[-1]
+                best = again if again.evidence > before.evidence and again.settled >= before.settled else before
+                best = replace(best, labels=before.labels, rollouts=before.rollouts + again.rollouts)
+                fitted = tuple(best if other is before else other for other in fitted)
+            after = replace(after, fitted=fitted, failed=state.failed, cut_off=None)
+        return replace(after, pruned=(*state.pruned, labels))
 
     def _fitted(
-        self, state: DiscoverState, labels: tuple[str, ...], initial: FloatArray, begin: FittedStructure | None
+        self, state: DiscoverState, labels: Labels, initial: FloatArray, begin: FittedStructure | None
     ) -> DiscoverState:
-        left, cut, began = max(self.budget - state.rollouts, 0), None, time.monotonic()
+        """With the fit of a structure from ``initial`` (N + P,) and the initial states of ``begin``, or its failure.
+
+        A fit that was cut short below its own part failed: its evidence is on the way.
+        """
+        left, one, began = max(self.budget - state.rollouts, 0), None, time.monotonic()
         self._rollouts, self._fit_rollouts = state.rollouts, 0
-        parts = [other for other in state.fitted if set(other.labels) < set(labels)]
-        part = max(parts, key=lambda other: other.evidence, default=None)
+        part = max(parts_of(labels, state.fitted), key=lambda other: other.evidence, default=None)
+        short = False  # whether the budget or the time may have ended the fit
         try:
-            most = self.enough(labels)
-            cut = state.phase if left < most else None
-            budget = max(min(most, left), 1)
-            one = self.fitting.fit(self.structure(labels), initial, budget, self._tell, begin, part)
-            cut = state.phase if self.is_late else cut
+            most = self.fitting.enough(self.structure(labels))
+            short = left < most
+            one = self.fitting.fit(self.structure(labels), initial, max(min(most, left), 1), self._tell, begin, part)
+            short = not one.settled and (short or self.fitting.is_late)
             self._longest = max(self._longest, (time.monotonic() - began) / self._slowness(labels))
         except (BudgetTooSmall, np.linalg.LinAlgError, ValueError) as error:
-            spent = state.failed_rollouts + self._fit_rollouts
-            cut = (state.phase if self.is_late else cut) if isinstance(error, BudgetTooSmall) else None
+            short = isinstance(error, BudgetTooSmall) and (short or self.fitting.is_late)
+        cut = state.phase if short else None
+        if one is None or (not one.settled and part is not None and part.evidence > one.evidence):
+            spent = state.failed_rollouts + (self._fit_rollouts if one is None else one.rollouts)
             return replace(state, failed=(*state.failed, labels), failed_rollouts=spent, cut=cut)
-        if one.settled:
-            return replace(state, fitted=(*state.fitted, one))
-        if state.surpasses(one):  # on the way, with the noise of a stage that is not the last
-            spent = state.failed_rollouts + one.rollouts
-            return replace(state, failed=(*state.failed, labels), failed_rollouts=spent, cut=cut)
-        cut_off = None if cut is None else labels
-        return replace(state, fitted=(*state.fitted, one), cut=cut, cut_off=cut_off)
+        return replace(state, fitted=(*state.fitted, one), cut=cut, cut_off=labels if short else None)
 
 
-def _is_better(one: FittedStructure, part: FittedStructure) -> bool:
-    """Whether a structure is clearly better than its part; for a single extension one standard error is enough."""
-    gain = difference(one, part)
-    return gain.clear or (len(one.labels) == 1 and gain.nats > gain.error)
-
-
-def _merged(fitted: tuple[FittedStructure, ...], before: FittedStructure) -> tuple[FittedStructure, ...]:
-    """With the better one of two fits of a structure, the later of which comes last, in the place of the first."""
-    *rest, again = fitted
-    if again is before or set(again.labels) != set(before.labels):
-        return fitted
-    better = again if again.evidence > before.evidence and again.settled >= before.settled else before
-    better = replace(better, labels=before.labels, rollouts=before.rollouts + again.rollouts)
-    return tuple(better if one is before else one for one in rest)
+def _writes(piece: Placed) -> set[str]:
+    """The targets of an extension's parameters, and its label."""
+    return {piece.label, *(target for parameter in piece.parameters for target in parameter.targets)}

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sipe_bayes.core.arrays import FloatArray
+from sipe_bayes.core.arrays import FloatArray, IntArray
 from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.posterior import GaussianMixture
 from sipe_bayes.simulation.simulator import Simulator
@@ -18,23 +18,19 @@ from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.search import StructureSearch
 from sipe_bayes.structure.state import DiscoverState, Offer
 
-_NEGLIGIBLE = 1e-3  # weight below which a structure is left out of the average
-
 
 @dataclass(frozen=True)
 class StructureRow:
-    """A line of the table.
+    """A line of the table, in nats of log predictive density of held-out pieces where nothing else is said.
 
     Args:
-        sentences: what the structure has beyond the plain model; empty for it.
+        sentences: what the structure has beyond the plain model.
         labels: of its extensions.
-        evidence: nats over the plain model.
-        gain: log predictive density of held-out pieces over the plain model's, in nats.
-        error: standard error of the gain.
-        behind: nats by which it predicts worse than the first structure of the set that the logs support.
-        behind_error: standard error of that.
+        evidence: nats over the plain model's.
+        gain: over the plain model, with its standard ``error``.
+        behind: the first structure of the set that the logs support, with its standard ``behind_error``.
         tied: whether it is of that set: structures that the logs do not tell apart.
-        weight: in the stacked predictions; zero outside the set that the logs support.
+        weight: in the stacked predictions; zero outside the set.
         rollouts: that its fit took.
         refused: whether it is not written out, since its errors on held-out logs are larger.
     """
@@ -72,6 +68,16 @@ class Structures:
         return self.state.fitted
 
     @property
+    def plain(self) -> FittedStructure:
+        """The model as it was."""
+        return self.fitted[0]
+
+    @property
+    def best(self) -> FittedStructure:
+        """The simplest structure of the set, of native MJCF elements where these do as well."""
+        return self.supported[0]
+
+    @property
     def rollouts(self) -> int:
         """Of all fits."""
         return self.state.rollouts
@@ -88,15 +94,15 @@ class Structures:
             return ""
         count = f"{len(self.fitted)} structures fitted" if len(self.fitted) > 1 else "the model as it is fitted"
         self.search.place(self.state)
-        here = self.best
-        if not here.labels:
+        best, sizes = self.best, list[str]()
+        if not best.labels:
             return f"{count}, no extension is supported so far"
-        sizes = []
-        own = [parameter for piece in self.placed(here) for parameter in piece.parameters]
-        for parameter, theta in zip(own, here.theta[len(here.theta) - len(own) :], strict=True):
-            sizes.append(f"{parameter.targets[0]} {float(parameter.value(theta)):.3g} {parameter.unit}".rstrip())
-        kept = " + ".join(here.labels) + (f" ({', '.join(sizes)})" if sizes else "")
-        return f"{count}, the best so far {kept}, {difference(here, self.plain).nats:.0f} nats over the model as it was"
+        columns = best.columns(self.placed(best))
+        for piece in self.placed(best):
+            for parameter, theta in zip(piece.parameters, best.theta[columns[piece.label]], strict=True):
+                sizes.append(f"{parameter.targets[0]} {float(parameter.value(theta)):.3g} {parameter.unit}".rstrip())
+        kept = " + ".join(best.labels) + (f" ({', '.join(sizes)})" if sizes else "")
+        return f"{count}, the best so far {kept}, {difference(best, self.plain).nats:.0f} nats over the model as it was"
 
     @cached_property
     def supported(self) -> tuple[FittedStructure, ...]:
@@ -106,18 +112,8 @@ class Structures:
     @cached_property
     def weights(self) -> FloatArray:
         """Stacking weights (S,) of the fitted structures; zero outside the set that the logs support."""
-        stacked = dict(zip(map(id, self.supported), stack(self.supported).tolist(), strict=True))
-        return np.array([stacked.get(id(one), 0.0) for one in self.fitted])
-
-    @property
-    def best(self) -> FittedStructure:
-        """The simplest structure of the set, of native MJCF elements where these do as well."""
-        return self.supported[0]
-
-    @property
-    def plain(self) -> FittedStructure:
-        """The model as it was."""
-        return self.fitted[0]
+        stacked = {one.labels: weight for one, weight in zip(self.supported, stack(self.supported), strict=True)}
+        return np.array([stacked.get(one.labels, 0.0) for one in self.fitted])
 
     def placed(self, one: FittedStructure) -> list[Placed]:
         """The extensions of a structure."""
@@ -129,16 +125,15 @@ class Structures:
 
     def inclusion(self) -> dict[str, float]:
         """Sum of the weights of the structures with each extension that was tried, largest first."""
-        labels = {label for one in self.fitted for label in one.labels}
-        sums = {
-            label: float(sum(p for p, o in zip(self.weights, self.fitted, strict=True) if label in o.labels))
-            for label in labels
-        }
+        sums = dict[str, float]()
+        for weight, one in zip(self.weights.tolist(), self.fitted, strict=True):
+            for label in one.labels:
+                sums[label] = sums.get(label, 0.0) + weight
         return dict(sorted(sums.items(), key=lambda item: (-item[1], item[0])))
 
-    def offers(self, at: Sequence[str] = ()) -> list[Offer]:
-        """Predicted gains beside a structure, best first."""
-        return sorted((o for o in self.state.offers if set(o.at) == set(at)), key=lambda o: -o.gain)
+    def offers(self) -> list[Offer]:
+        """Predicted gains beside the plain model, best first."""
+        return sorted((offer for offer in self.state.offers if not offer.at), key=lambda offer: -offer.gain)
 
     def table(self) -> list[StructureRow]:
         """All that was fitted: the set that the logs support, then by what they predict."""
@@ -153,30 +148,21 @@ class Structures:
     def posterior(self) -> GaussianMixture:
         """Of the user's parameters, stacked over the structures."""
         space = self.search.fitting.prior.space
-        return self._stacked(space, [(p, one, 0) for p, one in self._weighed()])
+        return self._stacked(space, [np.arange(len(space))] * len(self.fitted))
 
     def posterior_of_piece(self, label: str) -> GaussianMixture:
         """Of the parameters of an extension of the best structure, stacked over the structures that have it."""
-        having = []
-        for p, one in self._weighed():
-            if label in one.labels:
-                before = sum(len(self.search.placed[o].parameters) for o in one.labels[: one.labels.index(label)])
-                having.append((p, one, len(self.search.fitting.prior.space) + before))
-        return self._stacked(ParameterSpace(self.search.placed[label].parameters), having)
+        space = ParameterSpace(self.search.placed[label].parameters)
+        return self._stacked(space, [one.columns(self.placed(one)).get(label) for one in self.fitted])
 
-    def _weighed(self) -> list[tuple[float, FittedStructure]]:
-        """Structures of the set, with their weights."""
-        pairs = zip(self.weights.tolist(), self.fitted, strict=True)
-        return [(p, one) for p, one in pairs if p > _NEGLIGIBLE]
-
-    @staticmethod
-    def _stacked(space: ParameterSpace, parts: Sequence[tuple[float, FittedStructure, int]]) -> GaussianMixture:
-        """The mixture of the normals that structures have for the parameters of a space, each from an index on."""
-        own = [(one, slice(first, first + len(space))) for _, one, first in parts]
-        means = np.stack([one.mean[at] for one, at in own])
-        covariances = np.stack([one.spanned[at, at] for one, at in own])
+    def _stacked(self, space: ParameterSpace, columns: Sequence[IntArray | None]) -> GaussianMixture:
+        """The mixture of the normals of a space's parameters, which each structure has in these columns or has not."""
+        every = zip(self.weights.tolist(), self.fitted, columns, strict=True)
+        parts = [(weight, one, own) for weight, one, own in every if weight > 1e-3 and own is not None]
+        means = np.stack([one.mean[own] for _, one, own in parts])
+        covariances = np.stack([one.spanned[np.ix_(own, own)] for _, one, own in parts])
         # a draw is to come from a structure with its weight, however much of its normal the cube cuts off
-        return GaussianMixture(np.log([p for p, _, _ in parts]), means, covariances, space).of_masses()
+        return GaussianMixture(np.log([weight for weight, _, _ in parts]), means, covariances, space).of_masses()
 
     def posterior_of(self, one: FittedStructure) -> GaussianMixture:
         """Of all parameters of one structure, the extensions' behind the user's."""

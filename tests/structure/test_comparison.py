@@ -10,6 +10,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from sipe_bayes.likelihood import Noise
 from sipe_bayes.structure.comparison import choose_ties, difference, stack
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.scores import Pieces
@@ -25,7 +26,7 @@ def structure(labels: str, *density: float, evidence: float = 0.0, logs: int = 1
     log = np.repeat(np.arange(logs), -(-count // logs))[:count]
     held = Pieces(np.array(density, float), log, np.ones(count))
     return FittedStructure(
-        tuple(labels), theta, theta, np.eye(len(theta)), EMPTY, EMPTY, EMPTY, evidence, held, 1, settled=True
+        tuple(labels), theta, theta, np.eye(len(theta)), Noise(EMPTY, EMPTY), EMPTY, evidence, held, 1, settled=True
     )
 
 
@@ -114,7 +115,7 @@ def search_of(*fitted: FittedStructure, **needs: float) -> tuple[StructureSearch
     )
     search, asked = StructureSearch(fitting, ()), list[FittedStructure]()
     named = SimpleNamespace(extension=SimpleNamespace(native=True, slow=1), parameters=(None,))
-    search._placed = dict.fromkeys("abcd", named)  # type: ignore[arg-type]
+    search.placed = dict.fromkeys("abcd", named)  # type: ignore[arg-type]
 
     def fit(state: DiscoverState, labels: tuple[str, ...], initial: np.ndarray, begin: object) -> DiscoverState:
         assert initial.tolist() == [0.5, *(ord(x) / 1000 for x in labels)]
@@ -160,8 +161,7 @@ def test_pruning_ends_where_the_least_needed_extension_is_needed(b: float, asked
 def test_what_predicts_held_out_logs_worse_is_not_in_the_set(held_out: float, kept: str) -> None:
     """However much better it predicts pieces of the training log."""
     pieces = [20.0] * 10 + [held_out] * 10
-    search, _ = search_of()
-    log = np.repeat([0, 1], 10)
+    (search, _), log = search_of(), np.repeat([0, 1], 10)
     fitted = [structure("", *np.zeros(20)), structure("a", *pieces)]
     fitted = [replace(one, held=replace(one.held, log=log)) for one in fitted]
     assert [one.labels for one in search.supported(DiscoverState(Phase.DONE, tuple(fitted)))] == [tuple(kept)]

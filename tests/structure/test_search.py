@@ -15,7 +15,7 @@ from sipe_bayes.core.budget import BudgetTooSmall
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.laplace import Laplace
-from sipe_bayes.likelihood import Segments
+from sipe_bayes.likelihood import Noise, Segments
 from sipe_bayes.structure import DiscoverOptions, Extension, Restriction, Structures, discover
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.machine import Machine
@@ -25,7 +25,7 @@ from tests.problems.pendulums import log, pendulum
 
 FRICTION = Parameter("friction", 0.0, 0.3, targets=("joint:hinge.frictionloss",))
 DRAG = Parameter("drag", 0.0, 0.3, targets=("joint:hinge.damping_quadratic",))
-NO_PIECES = Pieces(np.zeros(0), np.zeros(0, np.int64), np.zeros(0))
+NO_PIECES, WHITE = Pieces(np.zeros(0), np.zeros(0, np.int64), np.zeros(0)), Noise(np.zeros(0), np.zeros(0))
 NAMES = ("dry_friction", "quadratic_damping", "delay", "offset", "spring")
 
 
@@ -218,7 +218,7 @@ def test_a_long_log_is_searched_on_blocks_of_it() -> None:
 def test_a_larger_budget_begins_anew_where_the_smaller_one_told_the_beginning_short() -> None:
     """A plain fit that had not come to rest in its share; else it goes on."""
     plain = FittedStructure(
-        (), np.zeros(1), np.zeros(1), np.eye(1), np.zeros(0), np.zeros(0), np.zeros(0), 0.0, NO_PIECES, 7, settled=True
+        (), np.zeros(1), np.zeros(1), np.eye(1), WHITE, np.zeros(0), 0.0, NO_PIECES, 7, settled=True
     )
     state = DiscoverState(phase=Phase.FIT, fitted=(plain,), queue=(("a",),), budget=100)
     assert state.with_budget(200, 150) == replace(state, budget=200)

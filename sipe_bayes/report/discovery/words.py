@@ -10,8 +10,6 @@ from sipe_bayes.report.verdicts import Verdict
 from sipe_bayes.report.words import correlation_time, error_text, listed, significant, unit_text
 from sipe_bayes.structure.structures import StructureRow
 
-_VALUES, _NAMED = 3, 2  # that a sentence lists
-
 
 def nats(value: float | None) -> str:
     """A gain in nats with its sign; a dash where it is not known."""
@@ -19,14 +17,13 @@ def nats(value: float | None) -> str:
 
 
 def found_values(discovery: Discovery, piece: Piece) -> str:
-    """The values of a kept piece's parameters with their 90 % intervals; of many the first ones."""
-    rows = {row["name"]: row for row in value_rows(discovery) if row["added"]}
-    mine = [rows[name] for name in piece.parameters if name in rows]
+    """The values of a kept piece's parameters with their 90 % intervals; of many the first three."""
+    rows = [row for row in value_rows(discovery) if row["added"] and row["name"] in piece.parameters]
     texts = []
-    for row in mine[:_VALUES]:
+    for row in rows[:3]:
         value = f"{row['value']} {row['unit']}".rstrip() + f" ({row['interval']})"
-        texts.append(value if len(mine) == 1 else f"{row['name'].rpartition('.')[2]} {value}")
-    return listed([*texts, *([f"{len(mine) - _VALUES} more"] if len(mine) > _VALUES else [])])
+        texts.append(value if len(rows) == 1 else f"{row['name'].rpartition('.')[2]} {value}")
+    return listed(texts + [f"{len(rows) - 3} more"] * (len(rows) > 3))
 
 
 def with_error(value: float, error: float) -> str:
@@ -63,26 +60,26 @@ def alternative_text(row: StructureRow) -> str:
 def headline(discovery: Discovery) -> Verdict:
     """What the model lacks, and how much of it."""
     kept = "; and ".join(", ".join(filter(None, [p.sentence, found_values(discovery, p)])) for p in discovery.kept)
-    if kept and (cut_short(discovery) or not discovery.settled):
-        among = f"Not all of the {len(discovery.rows)} structures were fitted to their end; of these"
-        if cut_short(discovery):
-            among = f"Of the {len(discovery.rows)} structures that were fitted before the search ended"
+    cut, count = cut_short(discovery), len(discovery.rows)
+    if kept and (cut or not discovery.settled):
+        among = f"Not all of the {count} structures were fitted to their end; of these"
+        if cut:
+            among = f"Of the {count} structures that were fitted before the search ended"
         return Verdict("bad", f"{among}, the simplest of the best has {kept}.")
     if kept:
         best = discovery.rows[0]
         gain = f"the log predictive density rises by {with_error(best.gain, best.error).lstrip('+')} nats"
         return Verdict("good" if discovery.passes else "fair", f"The logs support {kept}: {gain}.")
-    if discovery.passes and cut_short(discovery):
+    if discovery.passes and cut:
         return Verdict("fair", "The residuals pass for noise; whether something is lacking was not tried to the end.")
     if discovery.passes:
         return Verdict("good", "Nothing is lacking that these logs would show.")
-    if not discovery.pieces and cut_short(discovery):
-        return Verdict(
-            "bad", "The residuals are not noise; no piece was fitted to its end, so what the model lacks is not known."
-        )
-    if cut_short(discovery):
-        return Verdict("bad", "The residuals are not noise; of what was fitted nothing is shown to be lacking yet.")
-    return Verdict("bad", "The residuals are not noise, and nothing that was tried is what the model lacks.")
+    why = ", and nothing that was tried is what the model lacks"
+    if cut and discovery.pieces:
+        why = "; of what was fitted nothing is shown to be lacking yet"
+    elif cut:
+        why = "; no piece was fitted to its end, so what the model lacks is not known"
+    return Verdict("bad", f"The residuals are not noise{why}.")
 
 
 def held_out_verdict(discovery: Discovery) -> Verdict | None:
@@ -106,17 +103,15 @@ def ties(discovery: Discovery) -> Verdict | None:
     """Which structures the logs do not tell apart, what would, and what is left out since it is not needed."""
     others, best, texts = [alternative_text(row) for row in alternatives(discovery)], discovery.rows[0], list[str]()
     if others:
-        more = [f"{len(others) - _NAMED} more"] if len(others) > _NAMED else []
+        named = listed(others[:2] + [f"{len(others) - 2} more"] * (len(others) > 2))
         parts = any(one.code is Code.SEARCHED_ON_PARTS for one in discovery.findings)
         would = "Logs cut to where they differ, or other motions," if parts else "More logs, or other motions,"
-        named = listed([*others[:_NAMED], *more])
         texts.append(f"Within two standard errors these structures predict the logs as well: {named}.")
         texts.append(f"The simplest of them, {structure_text(best)}, is written to discovered.xml. {would} may tell.")
     larger = max(discovery.rows, key=lambda row: row.gain)
     if not larger.tied and larger.gain > best.gain and set(best.labels) < set(larger.labels):
-        added = listed(
-            [x for x, label in zip(larger.sentences, larger.labels, strict=True) if label not in best.labels]
-        )
+        pairs = zip(larger.sentences, larger.labels, strict=True)
+        added = listed([sentence for sentence, label in pairs if label not in best.labels])
         gain = with_error(-larger.behind, larger.behind_error)
         worse = larger.refused or -larger.behind > 2 * larger.behind_error
         why = "held-out logs are predicted worse with it" if worse else "less than two standard errors"
@@ -139,11 +134,10 @@ def remains(discovery: Discovery) -> Verdict | None:
 
 def trust(discovery: Discovery) -> Verdict:
     """Which intervals hold: those stacked over the structures, once residuals pass and the search has settled."""
-    cut = cut_short(discovery)
-    usable = discovery.kept and discovery.best_settled and any(p.further is not None for p in discovery.parameters)
+    cut, widened = cut_short(discovery), any(p.further is not None for p in discovery.parameters)
     if cut is not None and discovery.passes and discovery.best_settled:
         return Verdict("fair", f"Values may be trusted within the printed intervals, though {cut}.")
-    if cut is not None and usable:
+    if cut is not None and discovery.kept and discovery.best_settled and widened:
         return Verdict("fair", f"Use values within the intervals with what the model lacks, no narrower: {cut}.")
     if cut is not None:
         return Verdict("bad", f"No value may be trusted yet: {cut}.")
@@ -151,7 +145,7 @@ def trust(discovery: Discovery) -> Verdict:
         return Verdict("bad", "No value may be trusted yet: the search ended before it had settled; raise its budget.")
     if discovery.passes:
         return Verdict("good", "Values may be trusted within the printed intervals.")
-    if any(p.further is not None for p in discovery.parameters):
+    if widened:
         text = "Use values within the intervals with what the model lacks: the plain ones are those of models that are"
         return Verdict("fair", f"{text} still wrong.")
     text = "No value may be trusted within its interval yet: the intervals are those of models that are still wrong"
@@ -185,19 +179,18 @@ def residual_lines(discovery: Discovery) -> list[str]:
     lines = []
     for channel, before in discovery.before.noise.items():
         after = discovery.after.noise[channel]
-        sizes = " to ".join(error_text(noise.sd) for noise in (before, after))
-        times = " to ".join(correlation_time(noise) for noise in (before, after))
-        lines.append(f"{channel}: sd from {sizes} {unit_text(after.unit)}, correlation time from {times}")
+        sizes = f"sd from {error_text(before.sd)} to {error_text(after.sd)} {unit_text(after.unit)}"
+        lines.append(
+            f"{channel}: {sizes}, correlation time from {correlation_time(before)} to {correlation_time(after)}"
+        )
     return lines
 
 
 def error_line(row: ModelErrors) -> str:
     """One log and channel: as given, before, after."""
-    fits = f"{error_text(row.fitted_before)} to {error_text(row.fitted_after)}"
-    measured = f"{error_text(row.before)} to {error_text(row.after)}"
-    unit = unit_text(row.unit)
-    started = f"from measured starts {measured} (as given {error_text(row.given)})"
-    return f"{row.log}, {row.channel}: RMSE {fits} {unit}; {started}"
+    fitted = f"RMSE {error_text(row.fitted_before)} to {error_text(row.fitted_after)} {unit_text(row.unit)}"
+    measured = f"{error_text(row.before)} to {error_text(row.after)} (as given {error_text(row.given)})"
+    return f"{row.log}, {row.channel}: {fitted}; from measured starts {measured}"
 
 
 def value_rows(discovery: Discovery) -> list[dict[str, str]]:
