@@ -33,9 +33,9 @@ from sipe_bayes.core.thresholds import Thresholds
 from sipe_bayes.core.units import DIMENSIONS, UNITS, unit_words
 from sipe_bayes.core.validation import MOST_ROLLOUTS
 from sipe_bayes.datasets.demonstrations import AGENT_FILES
-from sipe_bayes.diagnostics.catalogue import tasks
 from sipe_bayes.envs.foreign.load import LEAST_TIMESTEP
 from sipe_bayes.envs.foreign.trial import MOST_FILES
+from sipe_bayes.envs.registry import TASKS, make_task
 from sipe_bayes.envs.target_texts import TARGET_TEXTS
 from sipe_bayes.inference.registry import ESTIMATORS, estimator_class
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
@@ -211,7 +211,7 @@ force: it is tried only where `--only` or `[structure]` names it.
 def environments() -> str:
     """The benchmark's tasks."""
     cells = ("parameters", "observations", "actions", "reproduces")
-    rows = [(f"`{row['name']}`", *(row[k] for k in cells)) for row in tasks()]
+    rows = [(f"`{row['name']}`", *(row[k] for k in cells)) for row in (make_task(name).row() for name in TASKS)]
     return f"""# Environments
 
 `sipe envs` lists them; `sipe envs Door` prints one with what every parameter writes. What they are

@@ -176,13 +176,13 @@ def envs(
 ) -> None:
     """The benchmark's environments; with NAME its parameters and what each writes."""
     from sipe_bayes.core.files import to_json
-    from sipe_bayes.diagnostics.catalogue import tasks, to_json_row
-    from sipe_bayes.envs.registry import make_task
+    from sipe_bayes.envs.registry import TASKS, make_task
 
     with exit_on_error():  # assets may not be installed
-        rows, task = (tasks(), None) if name is None else ([], make_task(name))
+        task = None if name is None else make_task(name)
+        rows = [make_task(one).row() for one in TASKS] if task is None else []
     if as_json:
-        print(to_json(rows if task is None else to_json_row(task)))
+        print(to_json(rows if task is None else task.to_dict()))
     elif task is None:
         print_tasks(rows)
     else:
@@ -217,9 +217,7 @@ def print_task(task: Task) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from sipe_bayes.diagnostics.catalogue import describe
-
-    console, row = _console(), describe(task)
+    console, row = _console(), task.row()
     console.print(Text(f"{row['name']} ({row['id']}): {row['summary']}"))
     console.print(
         Text(

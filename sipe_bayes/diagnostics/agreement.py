@@ -2,12 +2,11 @@
 
 With m_k the optimum of log k and L_k its information (starts and its own nuisance parameters marginalised, directions
 of which it says less than a uniform prior left out), Q is the least of sum_k (m_k - mu)' L_k (m_k - mu) over a common
-mu. When the logs agree it is chi-square, with as many degrees of freedom as the logs determine directions, each by
-itself, less those that they determine together (Cochran's test). Along directions that even together they leave open mu
-keeps within the cube, which makes Q smaller than that at most.
+mu, within the cube where all leave it open. When the logs agree it is chi-square, with as many degrees of freedom as
+the logs determine directions, each by itself, less those that they determine together (Cochran's test).
 
-The parameter named is the one whose freedom to differ between logs lowers Q most, not merely that of the largest shift;
-none where even that leaves the logs in disagreement. Where the others agree without a log, that one is named.
+The parameter named is the one whose freedom to differ between logs lowers Q most; none where even that leaves the logs
+in disagreement. Where the others agree without a log, that one is named.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ def disagreement(space: ParameterSpace, logs: Sequence[LogEstimate]) -> Finding 
 
 
 def _says(parameter: Parameter, log: str, theta: float, sd: float) -> str:
-    """What a log says of a parameter, in words; the sd is half of what lies between the values a sd below and above."""
+    """What a log says of a parameter, in words; the sd is half of what lies between the values one below and above."""
     theta = float(np.clip(theta, -1.0, 2.0)) if parameter.scale == "log" else float(theta)  # else 1e99
     value, low, high = (float(parameter.value(x)) for x in (theta, theta - sd, theta + sd))
     width = (high - low) / 2

@@ -1,13 +1,10 @@
 """Bands that hold what a sensor reads: the posterior's, widened by what the training logs show to be missing.
 
-The posterior's band knows neither the noise nor what the model lacks, and errors grow with the time since a window
-began. Each channel's root-mean-square error by that time, the largest so far, scales a conformal widening (Y. Romano,
-E. Patterson, E. Candes, "Conformalized quantile regression", NeurIPS 2019, https://arxiv.org/abs/1905.03222): with
-scores s = max(low - y, y - high) / scale of the training samples, the band is low - q scale to high + q scale, where q
-is a quantile of s, at least 0. Samples of one piece of time are not exchangeable, tenths of a log nearly so: the
-quantile is that of K pieces, 0.9 (K + 1) / K.
-
-Deviation: the training logs also gave the estimate, so that their errors are somewhat small where parameters are many.
+Each channel's root-mean-square error by the time since a window began, the largest so far, scales a conformal widening
+(Y. Romano, E. Patterson, E. Candes, "Conformalized quantile regression", NeurIPS 2019,
+https://arxiv.org/abs/1905.03222): with scores s = max(low - y, y - high) / scale of the training samples, the band is
+low - q scale to high + q scale, where q >= 0 is the quantile of s at 0.9 (K + 1) / K; K tenths of logs are nearly
+exchangeable, samples are not. Deviation: the training logs also gave the estimate, which makes their errors smaller.
 """
 
 from __future__ import annotations
@@ -59,14 +56,13 @@ def predictive_bands(
     """The ends (W, L, C) of 90 % bands of logs by their use, widened by what those of ``train`` show.
 
     ``predicted`` are (2, W, L, C) at the mode ``theta`` (N,) and by what it is compared with; ``seed`` is of the
-    posterior's draws. Where it is the discrepancy-aware one (``lacking``), it is not known in which direction
-    predictions are wrong elsewhere, and bands are as wide on both sides of the mode.
+    posterior's draws. Bands of a discrepancy-aware one (``lacking``) are as wide on both sides of the mode.
     """
     narrow = {use: _posterior_band(own, theta, posterior, seed) for use, own in windows.items()}
-    if lacking:
-        for use, (low, high) in narrow.items():
-            half = np.maximum(predicted[use][0] - low, high - predicted[use][0])
-            narrow[use] = predicted[use][0] - half, predicted[use][0] + half
+    for use, (low, high) in narrow.items() if lacking else ():
+        mode = predicted[use][0]
+        half = np.maximum(mode - low, high - mode)
+        narrow[use] = mode - half, mode + half
     margin = widening(windows["train"], predicted["train"][0], *narrow["train"])
     return {use: widen(margin, *band) for use, band in narrow.items()}
 
@@ -77,12 +73,10 @@ def _posterior_band(
     """5 and 95 % quantiles (W, L, C) of predictions by draws of a posterior, whose mode is theta (N,)."""
     draws = posterior.sample((DRAWS,), generator=torch.Generator().manual_seed(seed)).numpy()
     lines = windows.predict(draws, measured_starts(windows, draws, theta))[0]
-    if np.isfinite(lines).all():
-        low, high = np.quantile(lines, [0.05, 0.95], axis=0)  # many times faster than with NaN
-        return low, high
+    quantile = np.quantile if np.isfinite(lines).all() else np.nanquantile  # many times faster than with NaN
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # samples that no draw reached
-        low, high = np.nanquantile(lines, [0.05, 0.95], axis=0)
+        low, high = quantile(lines, [0.05, 0.95], axis=0)
     return low, high
 
 

@@ -1,9 +1,8 @@
 """Is an estimator calibrated? Many truths drawn from the prior, a posterior for each.
 
 Three transforms of (posterior, truth) are uniform on [0, 1] when the posteriors are right; each is compared with
-uniform by the largest deviation of the empirical distribution on 99 levels, as the binomial tail probability there,
-calibrated by simulation, with the simultaneous band of T. Sailynoja, P.-C. Burkner, A. Vehtari 2022,
-https://arxiv.org/abs/2103.10522. (Kolmogorov and Smirnov's test sees too little in the tails.)
+uniform by the least binomial tail probability on 99 levels, calibrated by simulation, with the simultaneous band of
+T. Sailynoja, P.-C. Burkner, A. Vehtari 2022, https://arxiv.org/abs/2103.10522.
 
 - Ranks u_j = P(theta_j < theta*_j), by parameter: simulation-based calibration (S. Talts, M. Betancourt, D. Simpson,
   A. Vehtari, A. Gelman 2018, https://arxiv.org/abs/1804.06788). They see shift and width.
@@ -12,9 +11,8 @@ https://arxiv.org/abs/2103.10522. (Kolmogorov and Smirnov's test sees too little
 - TARP: the posterior's mass nearer to a random reference point than the truth is (P. Lemos, A. Coogan, Y. Hezaveh, L.
   Perreault-Levasseur 2023, https://arxiv.org/abs/2302.03026). It sees the parameters jointly.
 
-Masses are those of draws, ties broken at random, which makes them exactly uniform for a right posterior;
-``sbi.diagnostics`` breaks none. TARP's references are uniform in the cube. A method that returns the prior passes all
-three: look at contraction too. Draws of an ill-mixed chain fail though their distribution be right.
+Masses are those of draws, ties broken at random, which makes them exactly uniform for a right posterior. TARP's
+references are uniform in the cube. A method that returns the prior passes all three: look at contraction too.
 """
 
 from __future__ import annotations
@@ -30,7 +28,7 @@ import torch
 from numpy.typing import ArrayLike
 from scipy.special import betaln
 
-from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.thresholds import THRESHOLDS
 from sipe_bayes.posterior import Posterior
 
@@ -53,6 +51,15 @@ class Uniformity:
     high: FloatArray
     p: float
 
+    def share(self, level: float) -> float:
+        """Of the values at or below a level."""
+        return float(np.mean(self.values <= level))
+
+    @property
+    def lean(self) -> float:
+        """By how many standard errors the mean of the values is above 1/2."""
+        return float((self.values.mean() - 0.5) * np.sqrt(12 * len(self.values)))
+
 
 @dataclass(frozen=True)
 class CalibrationCheck:
@@ -70,7 +77,7 @@ class CalibrationCheck:
 
     def coverage(self, level: float) -> FloatArray:
         """The share (N,) of central intervals of ``level`` that hold the truth."""
-        return np.array([np.mean(u.values <= level) for u in self.intervals])
+        return np.array([interval.share(level) for interval in self.intervals])
 
     @property
     def _alarm(self) -> float:
@@ -83,10 +90,9 @@ class CalibrationCheck:
         rank, interval = self.ranks[j], self.intervals[j]
         if min(rank.p, interval.p) >= self._alarm:
             return "calibrated"
-        off, out = _lean(rank), _lean(interval)
-        if interval.p >= self._alarm or abs(off) > abs(out):
+        if interval.p >= self._alarm or abs(rank.lean) > abs(interval.lean):
             return "shifted"
-        return "too narrow" if out > 0 else "too wide"
+        return "too narrow" if interval.lean > 0 else "too wide"
 
     @property
     def calibrated(self) -> bool:
@@ -94,38 +100,34 @@ class CalibrationCheck:
         each = all(self.verdict(name) == "calibrated" for name in self.names)
         return each and self.tarp.p >= THRESHOLDS.miscalibrated
 
-    def _wrong(self, checks: tuple[Uniformity, ...]) -> list[tuple[str, Uniformity]]:
-        """Parameters whose check fails, with it."""
-        return [(name, check) for name, check in zip(self.names, checks, strict=True) if check.p < self._alarm]
-
     def sentences(self) -> list[str]:
         """One for the ranks, one for the coverage, one for TARP; each names what is wrong and by how much."""
         level = THRESHOLDS.shown_interval
-        least = min(u.p for u in self.ranks)
-        ranks = f"ranks: uniform for all parameters (smallest p = {least:.2g}, {self.truths} truths)"
-        if wrong := self._wrong(self.ranks):
-            name, worst = min(wrong, key=lambda pair: pair[1].p)
-            also = f", and for {len(wrong) - 1} more" if len(wrong) > 1 else ""
-            ranks = (
-                f"ranks: not uniform for {name} (p = {worst.p:.1g}){also}: the truth lies above the median "
-                f"{np.mean(worst.values > 0.5):.0%} of the time"
-            )
-        held = f"{level:.0%} intervals hold the truth {self.coverage(level).mean():.0%} of the time"
-        coverage = f"coverage: {held}: as they should (smallest p = {min(u.p for u in self.intervals):.2g})"
-        if wrong := self._wrong(self.intervals):
-            name, worst = min(wrong, key=lambda pair: (pair[1].p, -abs(_lean(pair[1]))))
-            share = np.mean(worst.values <= level)
-            coverage = f"coverage: {held}: {self.verdict(name)}, worst {name} with {share:.0%} (p = {worst.p:.1g})"
+        name, rank = min(zip(self.names, self.ranks, strict=True), key=lambda pair: pair[1].p)
+        ranks = f"uniform for all parameters (smallest p = {rank.p:.2g}, {self.truths} truths)"
+        if wrong := sum(one.p < self._alarm for one in self.ranks):
+            above, also = np.mean(rank.values > 0.5), f", and for {wrong - 1} more" if wrong > 1 else ""
+            ranks = f"not uniform for {name} (p = {rank.p:.1g}){also}: the truth lies above the median {above:.0%} of"
+            ranks += " the time"
+        rows = zip(self.names, self.intervals, strict=True)
+        name, interval = min(rows, key=lambda pair: (pair[1].p, -abs(pair[1].lean)))
+        held = f"as they should (smallest p = {interval.p:.2g})"
+        if interval.p < self._alarm:
+            held = f"{self.verdict(name)}, worst {name} with {interval.share(level):.0%} (p = {interval.p:.1g})"
         tarp = f"hold the truth as often as they should (p = {self.tarp.p:.2g})"
         if self.tarp.p < THRESHOLDS.miscalibrated:
             tarp = f"do not hold the truth as often as they say (p = {self.tarp.p:.1g})"
-        return [ranks, coverage, f"TARP: regions about random points {tarp}"]
+        return [
+            f"ranks: {ranks}",
+            f"coverage: {level:.0%} intervals hold the truth {self.coverage(level).mean():.0%} of the time: {held}",
+            f"TARP: regions about random points {tarp}",
+        ]
 
     def to_dict(self) -> dict[str, object]:
         """Plain data, for JSON."""
         parameters = []
         for name, rank, interval in zip(self.names, self.ranks, self.intervals, strict=True):
-            coverage = {str(x): float(np.mean(interval.values <= x)) for x in (0.5, 0.9, 0.95)}
+            coverage = {str(level): interval.share(level) for level in (0.5, 0.9, 0.95)}
             row = {"name": name, "verdict": self.verdict(name), "p_ranks": rank.p, "p_coverage": interval.p}
             parameters.append({**row, "coverage": coverage, "above_median": float(np.mean(rank.values > 0.5))})
         said = {"truths": self.truths, "calibrated": self.calibrated, "sentences": self.sentences()}
@@ -170,19 +172,12 @@ def clearly_wrong(ranks: FloatArray) -> bool:
     half fall. Against such a coin of chance p the mixture of all others, e_n = B(k + 1/2, n - k + 1/2) / B(1/2, 1/2) /
     (p^k (1 - p)^(n - k)) for k of n, ever reaches 1 / alpha with probability alpha at most (J. Ville 1939).
     """
-    inside, below = np.abs(2 * ranks - 1) <= THRESHOLDS.shown_interval, ranks < 0.5
-    enough = np.log(2 * ranks.shape[1] / THRESHOLDS.miscalibrated)  # shared out among the coins
-    return any(
-        max(_evidence(held, THRESHOLDS.shown_interval), _evidence(low, 0.5)) >= enough
-        for held, low in zip(inside.T, below.T, strict=True)
-    )
-
-
-def _evidence(outcomes: BoolArray, chance: float) -> float:
-    """Log e_n of outcomes (R,) against coins of a chance."""
-    n, k = len(outcomes), int(np.count_nonzero(outcomes))
+    level, n = THRESHOLDS.shown_interval, len(ranks)
+    k = np.stack([np.abs(2 * ranks - 1) <= level, ranks < 0.5]).sum(1)
+    chance = np.array([[level], [0.5]])
     mixture = betaln(k + 0.5, n - k + 0.5) - betaln(0.5, 0.5)
-    return float(mixture - k * np.log(chance) - (n - k) * np.log1p(-chance))
+    evidence = mixture - k * np.log(chance) - (n - k) * np.log1p(-chance)
+    return bool((evidence >= np.log(evidence.size / THRESHOLDS.miscalibrated)).any())  # shared out among the coins
 
 
 def mass_below(draws: FloatArray, truth: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -195,10 +190,10 @@ def tarp_values(
     draws: Sequence[FloatArray], truths: FloatArray, references: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
     """TARP's credibilities (R,): the mass of R draws (M, N) nearer to references (R, N) than truths (R, N) are."""
-    masses = [
-        mass_below(np.linalg.norm(d - r, axis=1, keepdims=True), np.linalg.norm(t - r, axis=0, keepdims=True), rng)
-        for d, t, r in zip(draws, truths, references, strict=True)
-    ]
+    masses = []
+    for points, truth, reference in zip(draws, truths, references, strict=True):
+        far, near = (np.linalg.norm(x - reference, axis=1, keepdims=True) for x in (points, truth[None]))
+        masses.append(mass_below(far, near[0], rng))
     return np.concatenate(masses)
 
 
@@ -218,10 +213,7 @@ def uniformity(values: FloatArray) -> Uniformity:
 
 @functools.lru_cache(maxsize=8)
 def _null(count: int) -> tuple[FloatArray, FloatArray]:
-    """Binomial tail probabilities (L, count + 1), the smaller side, of so many values at or below each level.
-
-    With them their least over the levels in 4000 simulations of uniform values.
-    """
+    """The smaller tail probability (L, count + 1) of values at or below levels; its least in simulations (4000,)."""
     k, level = np.arange(count + 1), LEVELS[:, None]
     tails = np.minimum(scipy.stats.binom.cdf(k, count, level), scipy.stats.binom.sf(k - 1, count, level))
     rng, smallest = np.random.default_rng(count), np.empty(4000)
@@ -229,8 +221,3 @@ def _null(count: int) -> tuple[FloatArray, FloatArray]:
         below = np.searchsorted(np.sort(rng.random(count)), LEVELS, side="right")
         smallest[i] = tails[np.arange(len(LEVELS)), below].min()
     return tails, smallest
-
-
-def _lean(seen: Uniformity) -> float:
-    """By how many standard errors the mean of the values is above 1/2."""
-    return float((seen.values.mean() - 0.5) * np.sqrt(12 * len(seen.values)))

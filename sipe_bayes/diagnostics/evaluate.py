@@ -37,14 +37,11 @@ def errors_from_best_starts(windows: BoundLikelihood, theta: FloatArray) -> Floa
 
 def _roots(windows: BoundLikelihood, square: FloatArray) -> FloatArray:
     """RMSE (B, logs, C) of squared errors (B, W, L, C)."""
-    out = np.full((len(square), len(windows.trajectories), len(windows.channels)), np.nan)
-    for k in range(len(windows.trajectories)):
-        mine = windows.log == k
-        count = windows.observed[mine].sum(axis=(0, 1))
-        total = square[:, mine].sum(axis=(1, 2))
-        out[:, k] = np.where(np.isfinite(total), np.sqrt(total / np.maximum(count, 1)), np.inf)
-        out[:, k, count == 0] = np.nan
-    return out
+    logs = [windows.log == k for k in range(len(windows.trajectories))]
+    count = np.stack([windows.observed[mine].sum(axis=(0, 1)) for mine in logs])
+    total = np.stack([square[:, mine].sum(axis=(1, 2)) for mine in logs], axis=1)
+    roots = np.where(np.isfinite(total), np.sqrt(total / np.maximum(count, 1)), np.inf)
+    return np.where(count == 0, np.nan, roots)
 
 
 def _squares(windows: BoundLikelihood, predicted: FloatArray) -> FloatArray:
@@ -64,15 +61,12 @@ def compare_errors(
     reference: tuple[BoundLikelihood, FloatArray] | None = None,
     fit_starts: bool = False,
 ) -> Comparison | None:
-    """Errors of theta (N,) against those of a reference, the nominal model if nothing else is named.
+    """Errors of theta (N,) against the nominal model, or a ``reference``: the same windows of another, and its theta.
 
     The mean over logs and channels of log(RMSE of the reference / RMSE of theta), with the jackknife's standard error
-    over tenths of each log (a paired t-test on pieces of time). In a log of few windows the pieces of one share its
-    start, and p is too small.
-
-    Where measured starts make nearly all of theta's error (velocities from noisy positions), or with ``fit_starts``,
-    both models are compared from the starts that each fits best. ``reference`` is the same windows of another
-    simulator, and its theta (M,). None where there is nothing finite to compare.
+    over tenths of each log: a paired t-test, too sure of a log of few windows. Where measured starts make nearly all of
+    theta's error (velocities from noisy positions), or with ``fit_starts``, both models are compared from the starts
+    that each fits best. None where there is nothing finite to compare.
     """
     models = (windows, theta), reference or (windows, np.clip(windows.simulator.space.default_theta, 0, 1))
     measured = [_squares(w, w.predict(x[None], measured_starts(w, x[None]))[0]) for w, x in models]
@@ -111,23 +105,19 @@ def _share_of_starts(windows: BoundLikelihood, square: FloatArray, fitted: Float
 
 def _jackknifed(parts: list[FloatArray]) -> Comparison:
     """parts: of each log the sums (2, pieces, channels) of squared errors, of theta and of the model as given."""
-    pairs = sum(part.shape[2] for part in parts)
-
-    def gain(sums: FloatArray) -> FloatArray:
-        """Sums (2, ..., C) as shares of the mean log ratio."""
-        return np.asarray(0.5 * np.log(sums[1] / sums[0]).sum(-1) / pairs)
-
+    pieces, pairs = (sum(part.shape[axis] for part in parts) for axis in (1, 2))
     mean, variance = 0.0, 0.0
     for part in parts:
-        whole, count = part.sum(1), part.shape[1]
-        mean += float(gain(whole))
-        without = gain(whole[:, None] - part)
+        whole, count = part.sum(1, keepdims=True), part.shape[1]
+        # shares of the mean log ratio: of all pieces, and without each
+        gain, without = (0.5 * np.log(own[1] / own[0]).sum(-1) / pairs for own in (whole, whole - part))
+        mean += float(gain[0])
         variance += (count - 1) / count * float(((without - without.mean()) ** 2).sum())
-    pieces = sum(part.shape[1] for part in parts)
     freedom, error = pieces - len(parts), max(float(np.sqrt(variance)), 1e-12)
     margin = float(scipy.stats.t.ppf(0.975, freedom)) * error
     p = float(2 * scipy.stats.t.sf(abs(mean) / error, freedom))
-    return Comparison(float(np.exp(mean)), float(np.exp(mean - margin)), float(np.exp(mean + margin)), p, pieces)
+    ratio, low, high = np.exp([mean, mean - margin, mean + margin]).tolist()
+    return Comparison(ratio, low, high, p, pieces)
 
 
 def fitted_units(windows: BoundLikelihood) -> list[str]:
@@ -189,15 +179,12 @@ def white_noise(windows: BoundLikelihood, theta: FloatArray) -> Noise:
 def fitted_residuals(windows: BoundLikelihood, theta: FloatArray, noise: Noise, starts: FloatArray) -> list[Residual]:
     """Residuals of each log and channel at theta (N,) and starts (W, D), whitened by noise (C,)."""
     residual = windows.residuals(theta[None], starts[None])[0][0]
-    white = np.full(residual.shape, np.nan)
+    both = np.stack([np.where(windows.observed, residual, np.nan), np.full(residual.shape, np.nan)])
     for c, own in enumerate(windows.whitened(residual[None], noise)):
-        flat = white[:, :, c].reshape(-1)
-        flat[windows.sequences[c].index] = own[0]
-        white[:, :, c] = flat.reshape(residual.shape[:2])
-    shown = np.where(windows.observed, residual, np.nan)
+        both[1].reshape(-1, residual.shape[2])[windows.sequences[c].index, c] = own[0]
     out = []
     for k, trajectory in enumerate(windows.trajectories):
-        raw, whitened = (_stitched(windows, x[None], k)[0] for x in (shown, white))
+        raw, whitened = _stitched(windows, both, k)
         for c, channel in enumerate(zip(windows.fitted, fitted_units(windows), strict=True)):
             out.append(Residual(trajectory.name, *channel, trajectory.time, raw[:, c], whitened[:, c]))
     return out

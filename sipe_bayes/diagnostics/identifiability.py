@@ -1,8 +1,7 @@
 """What the data cannot say: parameters that change nothing, ranges that are dead, directions left open.
 
-A ridge is a direction of small posterior variance in a space where the parameters one by one have large variance: the
-smallest principal components of the posterior's correlation matrix. It is described as a sum or, in logarithms, as a
-product (gear / mass, mass * length^2), whichever is the narrower.
+A ridge is a direction of small posterior variance among parameters of large variance: a smallest principal component of
+the correlation matrix, described as a sum or, in logarithms, as a product (gear / mass), whichever is the narrower.
 """
 
 from __future__ import annotations
@@ -21,10 +20,9 @@ GRID = (0.0, 0.25, 0.5, 0.75, 1.0)  # of theta, where parameters are tried
 
 
 def dead_ranges(windows: BoundLikelihood, theta: FloatArray) -> dict[str, list[tuple[float, float]]]:
-    """Where parameters change nothing, the others at theta (N,): pieces [a, b] of [0, 1] of each such parameter.
+    """Where parameters change no fitted channel, the others at theta (N,): pieces [a, b] of [0, 1] of each such one.
 
-    Over these it changes no fitted channel; a piece whose simulation diverges is not called dead. Costs five rollouts a
-    parameter and log, or of many windows those of some.
+    Costs five rollouts a parameter and log, or of many windows those of some; none may diverge.
     """
     names, few = list(windows.simulator.space.names), windows.spread_over(400)  # control steps
     if len(few) < windows.num_windows:
@@ -46,9 +44,9 @@ def _dead(windows: BoundLikelihood, theta: FloatArray, name: str) -> list[tuple[
 
 
 def ridges(space: ParameterSpace, draws: FloatArray, contraction: Sequence[float]) -> list[Ridge]:
-    """Combinations that are determined while their members are not.
+    """Combinations that are determined while their members are not, by draws (n, N) of the posterior in units.
 
-    By draws (n, N) of the posterior in units, and each parameter's contraction (N,), 1 - sd / prior sd.
+    ``contraction`` (N,) is each parameter's 1 - sd / prior sd.
     """
     spread = draws.std(0)
     moving = np.flatnonzero(spread > 1e-12 * np.maximum(np.abs(draws.mean(0)), 1e-300))
@@ -91,8 +89,10 @@ def _describe(
     if eigenvalues[0] > THRESHOLDS.ridge:
         return None
     loadings = np.abs(vectors[:, 0])
-    kept = _members(loadings)
-    largest = int(np.argmax(loadings > loadings.max() - 1e-9))  # of equal ones the first
+    kept, largest = (
+        _members(loadings),
+        int(np.argmax(loadings > (1 - 1e-9) * loadings.max())),
+    )  # of equal ones the first
     weights = vectors[:, 0] / x.std(0)
     weights = weights[kept] / weights[largest]
     names, units = ([getattr(space[members[k]], what) for k in kept] for what in ("name", "unit"))
@@ -111,12 +111,8 @@ def _describe(
 
 def _product(names: Sequence[str], weights: FloatArray) -> str:
     """Names, or units of which some are empty, with their powers."""
-
-    def factor(name: str, power: float) -> str:
-        return name if abs(power - 1) < 0.05 else f"{name}^{power:.2g}"
-
-    rows = [(n, w) for n, w in zip(names, weights, strict=True) if n]
-    above, below = [factor(n, w) for n, w in rows if w > 0], [factor(n, -w) for n, w in rows if w < 0]
+    rows = [(n, w, n if abs(abs(w) - 1) < 0.05 else f"{n}^{abs(w):.2g}") for n, w in zip(names, weights, strict=True)]
+    above, below = ([factor for n, w, factor in rows if n and sign * w > 0] for sign in (1, -1))
     text = " * ".join(above) or "1"
     return f"{text} / {below[0] if len(below) == 1 else '(' + ' * '.join(below) + ')'}" if below else text
 

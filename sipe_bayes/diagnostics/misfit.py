@@ -1,7 +1,6 @@
 """Can the model explain the log? Residuals that are not noise.
 
-In the linear model of ``structure.augmented``, with parameters and initial states free to follow and autoregressive
-noise, two kinds of statistics are looked at.
+In the linear model of ``structure.augmented``, with autoregressive noise, two kinds of statistics are looked at.
 
 - *Probes*: the score statistic of the size of each extension (C. R. Rao 1948,
   https://doi.org/10.1017/S0305004100023987), all else projected out; none where a size may not be negative and is.
@@ -11,14 +10,11 @@ noise, two kinds of statistics are looked at.
 
 The null is simulated: noise as estimated, drawn anew, projected alike. Each statistic's cube root is standardised by
 its mean and sd over these and the log's; the largest is compared with the largest of each. So the p-value holds for
-white and first-order autoregressive noise and any number of probes, up to the linearisation. Named are the extensions
-that the strongest effect of ``structure.single_effects`` may be.
+any number of probes, up to the linearisation. Named are the extensions that the strongest effect of
+``structure.single_effects`` may be.
 
-Deviations:
-
-- The log's own noise is that of the fit, of whose estimation the null knows but the first autocorrelation.
-- Probes are of a user's MJCF; of other environments only whiteness is asked, which slow misfit passes as slow noise.
-- Where dry friction holds the simulated joint still, a small step of what acts on it changes nothing, and says nothing.
+Deviations: the null knows of the noise's estimation but the first autocorrelation. Without a user's MJCF only whiteness
+is asked, which slow misfit passes as slow noise.
 """
 
 from __future__ import annotations
@@ -38,10 +34,9 @@ _PIECES = 10  # of a log, among which the largest mean square is looked for
 
 
 def misfit(found: Discrepancy, sd: FloatArray | None = None, seed: int = 0, simulated: int = 199) -> Misfit:
-    """How odd the residuals of fitted logs are, and what they look like most.
+    """How odd the residuals of fitted logs are, against ``simulated`` draws of the null, and what they look like most.
 
-    ``sd`` (N,) is that of the posterior in theta, by default of the linearisation; 199 draws of the null resolve half a
-    percent.
+    ``sd`` (N,) is that of the posterior in theta, by default of the linearisation.
     """
     seen = found.at.logs.seen
     null = statistics(seen, drawn(seen, np.random.default_rng(seed), simulated))
@@ -50,17 +45,18 @@ def misfit(found: Discrepancy, sd: FloatArray | None = None, seed: int = 0, simu
     p = float((1 + (largest >= odd.max()).sum()) * floor)
     sd = np.sqrt(np.diag(seen.projected.covariance)) if sd is None else sd
     effect, probes = None if found.effects is None else found.effects.single[0], seen.logs.probes
+    sizes = np.zeros(len(probes))
     if effect is not None and effect.present > 0.5:
-        sizes, first = np.zeros(len(probes)), {probes[k].name: probes[k] for k in reversed(found.usable)}
+        first = {probes[k].name: probes[k] for k in reversed(found.usable)}
         sizes[found.usable] = effect.sizes / effect.present
         named = _of_sizes(found.at, sizes, [first[name] for name in effect.alike()], sd, p)
         if worst < len(probes) or not named.is_small:
             return replace(named, floor=floor)
-    if worst < len(probes):
-        made, sizes = seen.projected, np.zeros(len(probes))
-        sizes[worst] = made.score[worst] / made.information[worst, worst]
-        return replace(_of_sizes(seen, sizes, [probes[worst]], sd, p), floor=floor)
-    return replace(_of_colour(seen, worst - len(probes), p), floor=floor)
+    if worst >= len(probes):
+        return replace(_of_colour(seen, worst - len(probes), p), floor=floor)
+    sizes = np.zeros(len(probes))
+    sizes[worst] = seen.projected.score[worst] / seen.projected.information[worst, worst]
+    return replace(_of_sizes(seen, sizes, [probes[worst]], sd, p), floor=floor)
 
 
 def drawn(at: AtNoise, random: np.random.Generator, simulated: int) -> FloatArray:
@@ -81,7 +77,7 @@ def drawn(at: AtNoise, random: np.random.Generator, simulated: int) -> FloatArra
 def statistics(at: AtNoise, residuals: FloatArray, own: bool = False) -> FloatArray:
     """Cube roots (S, K + 2 C) of residuals (W, L, C, S): of probes' scores, autocorrelations and largest mean squares.
 
-    own: whether they are the logs', at which the prior of theta pulls.
+    At the logs' ``own`` the prior of theta pulls.
     """
     logs, made, arrow, n = at.logs, at.projected, at.arrow, at.logs.windows.num_theta
     gradient, force = logs.rows.scores(residuals, at.noise)
@@ -104,17 +100,11 @@ def statistics(at: AtNoise, residuals: FloatArray, own: bool = False) -> FloatAr
 
 
 def _whiteness(at: AtNoise, left: FloatArray) -> FloatArray:
-    """(2 C, S) of what is left (S, W, L, C): autocorrelations, then largest mean squares.
-
-    Both are none of a channel whose noise is but the simulation's rounding, as of a joint that rests: that follows
-    itself. Of coloured noise the first autocorrelation is taken out, as an estimate of the noise would.
-    """
-    logs = at.logs
-    tells = ~logs.rests(at.noise.sd)
-    memory, bursts = [], []
-    for z, told in zip(logs.windows.whitened(left, at.noise), tells, strict=True):
-        z = z * told
-        if logs.coloured:
+    """(2 C, S) of what is left (S, W, L, C): autocorrelations, then largest mean squares; none of rounding."""
+    logs, memory, bursts = at.logs, [], []
+    for z, rests in zip(logs.windows.whitened(left, at.noise), logs.rests(at.noise.sd), strict=True):
+        z = z * ~rests
+        if logs.coloured:  # the first autocorrelation is taken out, as an estimate of the noise would
             first = (z[:, 1:] * z[:, :-1]).sum(1) / np.maximum((z**2).sum(1), 1e-300)
             z = np.concatenate([z[:, :1], z[:, 1:] - first[:, None] * z[:, :-1]], axis=1)
         centred = z - z.mean(1, keepdims=True)
@@ -147,12 +137,11 @@ def _of_sizes(at: AtNoise, sizes: FloatArray, causes: list[Probe], sd: FloatArra
     """That probes are at work, at sizes (K,), beside the noise that they leave; theta has sds (N,)."""
     logs = at.logs
     before, after = at.left(np.zeros_like(sizes)), at.left(sizes)
-    whitened = zip(*(logs.windows.whitened(left[None], at.noise) for left in (before, after)), strict=True)
-    gains = [plain[0] ** 2 - other[0] ** 2 for plain, other in whitened]
+    gains = [z[0] ** 2 - z[1] ** 2 for z in logs.windows.whitened(np.stack([before, after]), at.noise)]
     share = np.clip(1 - (after**2).sum((0, 1)) / np.maximum((before**2).sum((0, 1)), 1e-300), 0, 1)
     moved = logs.traded(sizes) - at.projected.answer @ sizes
     shift = (np.clip(logs.theta + moved, 0, 1) - logs.theta) / np.maximum(sd, 1e-12)
-    cause, remedy = " or ".join(c.name for c in causes), " or ".join(c.remedy for c in causes)
+    cause, remedy = " or ".join(c.name for c in causes), " or ".join(c.placed.remedy for c in causes)
     moves = dict(zip(logs.windows.simulator.space.names, shift.tolist(), strict=True))
     placed = _placed(logs.seen, p, cause, remedy + "; or run sipe discover", gains, share)
     return replace(placed, shift=moves, alike=len(causes))
@@ -162,16 +151,16 @@ def _of_colour(seen: AtNoise, statistic: int, p: float) -> Misfit:
     """That samples follow one another, or are larger for a while; statistic: of 2 C, autocorrelations first."""
     logs, channels = seen.logs, len(seen.noise.sd)
     white = [z[0] for z in logs.windows.whitened(seen.left(seen.sizes)[None], seen.noise)]
-    share, gains = np.zeros(channels), [np.zeros(len(z)) for z in white]
-    c = statistic % channels
+    share, gains, c = np.zeros(channels), [np.zeros(len(z)) for z in white], statistic % channels
     if statistic < channels:
         before = [np.concatenate([np.zeros(lag), white[c][:-lag]]) for lag in lags(white[c])]
         rows = np.stack(before or [np.zeros_like(white[c])], axis=1)
         gains[c] = white[c] ** 2 - (white[c] - rows @ np.linalg.lstsq(rows, white[c], rcond=None)[0]) ** 2
         share[c] = gains[c].sum() / max((white[c] ** 2).sum(), 1e-300)
         cause = "samples that follow one another, as an effect does that no probe stands for"
-        coloured = "look at the residuals' plot for what moves with them"
-        remedy = coloured if logs.coloured else f'use noise = "ar1"; then {coloured}'
+        remedy = (
+            'use noise = "ar1"; then ' * (not logs.coloured) + "look at the residuals' plot for what moves with them"
+        )
     else:
         gains[c] = white[c] ** 2
         most = max(float(piece.sum()) for piece in np.array_split(gains[c], _PIECES))

@@ -8,7 +8,6 @@ S. Young 1993, "Resampling-based multiple testing").
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,8 +29,8 @@ STEPS = 2000  # control steps of windows spread evenly over long logs
 class OutsidePrior:
     """Where a log lies among simulations of the prior, and the channel and time, in s, where it is farthest.
 
-    ``p`` is that of a log as far from them as this one, ``floor`` the least that they can give; ``followed``: whether
-    the calibrated model follows the log all the same, but for what it is named to lack.
+    ``p`` is that of a log as far from them as this one, at least ``floor``; ``followed``: whether the calibrated model
+    follows the log all the same.
     """
 
     p: float
@@ -52,34 +51,32 @@ class OutsidePrior:
         severity, remedy = Severity.BLOCKING, "widen the bounds, or correct the model, units or signs"
         if self.followed:
             severity, remedy = Severity.CAUTION, "the calibrated model follows it all the same"
-        about = functools.partial(finding, Code.OUTSIDE_PRIOR, log=self.log, severity=severity, remedy=remedy)
-        return about(p=p_text(self.p, self.floor), channel=self.channel, time=self.time)
+        values = {**vars(self), "p": p_text(self.p, self.floor), "remedy": remedy}
+        return finding(Code.OUTSIDE_PRIOR, severity=severity, **values)
 
 
 def outside_prior(
     windows: BoundLikelihood, prior: Posterior, noise: Noise, *, seed: int = 0, followed: bool = False
 ) -> list[OutsidePrior]:
-    """For each log its place among simulations of the prior; those that diverge are left out.
+    """For each log its place among simulations of the prior with ``noise`` (O,) of all channels.
 
-    It is looked at in windows: commands of a controller, replayed over a whole log, drive every model but the true one
-    away, and the log would be outside by staying.
-
-    ``noise`` (O,) is that of all channels, ``seed`` of the simulations; ``followed`` see ``OutsidePrior``.
+    By windows: commands of a controller, replayed over a whole log, drive every model but the true one away, and the
+    log would be outside by staying. ``followed`` see ``OutsidePrior``.
 
     Raises:
-        ValueError: where more than half of the simulations diverge.
+        ValueError: where more than half of the simulations diverge; those that do are left out.
     """
     chosen = windows.spread_over(STEPS, every_log=True)
     ends = zip(windows.log[chosen], windows.start[chosen], (windows.start + windows.steps)[chosen], strict=True)
     logs = Trajectories.stack([windows.trajectories[int(log)].slice(int(a), int(b)) for log, a, b in ends])
     replicas, rng = Replicas(windows.simulator, logs, noise), np.random.default_rng(seed)
     thetas = prior.sample((SIMULATIONS,), generator=torch.Generator().manual_seed(seed)).numpy()
-    batches = np.array_split(thetas, max(1, SIMULATIONS // 10))  # so many are in memory at a time
+    batches = np.array_split(thetas, SIMULATIONS // 10)  # so many are in memory at a time
     replayed = (one for batch in batches for one in replicas.many(batch, rng, estimated=True))
     rotations = windows.simulator.environment.rotations
     made = [written_near(one.observations, logs.observations, rotations) for one in replayed if one is not None]
-    if (count := len(made)) < SIMULATIONS // 2:
-        did = f"{count} of {SIMULATIONS} simulations did not diverge"
+    if len(made) < SIMULATIONS // 2:
+        did = f"{len(made)} of {SIMULATIONS} simulations did not diverge"
         raise ValueError(f"prior: {did}, half are needed; narrow the bounds")
     far = np.zeros((len(logs), len(windows.channels), 1 + len(made)))
     farthest = np.zeros((len(logs), len(windows.channels)))
@@ -112,16 +109,16 @@ def outside_prior(
 def follows(windows: BoundLikelihood, predicted: FloatArray) -> bool:
     """Whether predictions (W, L, C) bend as the logs do, in every channel: with a wrong unit or sign they do not.
 
-    What a straight line in time leaves of the median window is compared with what it leaves of the difference: a start
-    that is slightly off leaves such a line. Where a channel rests in most windows, those in which it moves may speak.
+    What a straight line in time, as of a start that is slightly off, leaves of the median window is compared with what
+    it leaves of the difference; where a channel rests in most windows, of those in which it moves.
     """
     for c in range(windows.observed.shape[2]):
         pairs = []
-        for w, known in enumerate(windows.observed[..., c]):
+        for measured, simulated, known in zip(windows.measured, predicted, windows.observed[..., c], strict=True):
             if known.sum() > 5:
-                time = np.flatnonzero(known).astype(float)
+                time, own = np.flatnonzero(known).astype(float), measured[known, c]
                 line = np.linalg.qr(np.stack([np.ones_like(time), time], axis=1))[0]
-                both = np.stack([windows.measured[w, known, c] - predicted[w, known, c], windows.measured[w, known, c]])
+                both = np.stack([own - simulated[known, c], own])
                 pairs.append(np.linalg.norm(both - both @ line @ line.T, axis=1))
         if not pairs:
             continue
@@ -136,8 +133,8 @@ def follows(windows: BoundLikelihood, predicted: FloatArray) -> bool:
 def outlier_factors(simulated: FloatArray, log: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
     """Local outlier factors (1 + n,) of the log (F,) and of n simulations (n, F) among one another, and scales (F,).
 
-    A sample's scale is the sd over all of them, the log among them, so that under the null each is as likely to be the
-    farthest; at least ``least``. Nothing is told where the simulations do not vary.
+    Scales are sds over all, the log among them, so that under the null each is as likely to be the farthest; at least
+    ``least``. Nothing is told where the simulations do not vary.
     """
     from sklearn.neighbors import LocalOutlierFactor
 

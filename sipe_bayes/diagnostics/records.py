@@ -16,9 +16,9 @@ from sipe_bayes.core.thresholds import THRESHOLDS
 
 @dataclass(frozen=True)
 class ChannelScore:
-    """RMSE of one channel of one log in its unit, over open-loop windows from measured starts.
+    """RMSE of one channel of one log in its unit, over open-loop windows from measured starts: of the posterior mode.
 
-    ``rmse`` is that of the posterior mode, ``rmse_default`` that of the nominal model.
+    ``rmse_default`` is that of the nominal model.
     """
 
     log: str
@@ -30,8 +30,7 @@ class ChannelScore:
 
 def improvement(scores: Iterable[ChannelScore]) -> float:
     """How many times smaller the error became: geometric mean over logs and channels; NaN when none compares."""
-    ratios = [s.rmse_default / s.rmse for s in scores if s.rmse > 0 and s.rmse_default > 0]
-    ratios = [r for r in ratios if math.isfinite(r)]
+    ratios = [r for s in scores if s.rmse > 0 and s.rmse_default > 0 and math.isfinite(r := s.rmse_default / s.rmse)]
     return float(scipy.stats.gmean(ratios)) if ratios else math.nan
 
 
@@ -50,11 +49,11 @@ class BandCoverage:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Whether the held-out errors are smaller than those of the model as given.
+    """How many times smaller (``ratio``) the held-out errors are than those of the model as given.
 
-    ``ratio`` says how many times, as the geometric mean over logs and channels, with its 95 % interval and the ``p`` of
-    one as far from 1 where the models predict alike, by a paired t-test over pieces of the logs. ``starts`` is the
-    share of the calibrated model's error that measured starts made, where each model's best starts took their place.
+    The geometric mean over logs and channels with its 95 % interval, and the ``p`` of one as far from 1 where the
+    models predict alike, by a paired t-test over pieces of the logs. ``starts`` is the share of the calibrated model's
+    error that measured starts made, where each model's best starts took their place.
     """
 
     ratio: float
@@ -77,11 +76,10 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Signal:
-    """One channel of one log for drawing; all arrays (T+1,), NaN where there is nothing; time in s.
+    """One channel of one log, for its ``use`` (``train`` or ``holdout``); arrays (T+1,), NaN for nothing; time in s.
 
-    ``use`` is ``train`` or ``holdout``. Predictions are those of the posterior ``mode`` and of the nominal model
-    (``default``), ``low`` and ``high`` the ends of the 90 % band of what a sensor reads. ``window_starts`` (W,), in s,
-    is where every window of the log begins.
+    Predictions are those of the posterior ``mode`` and of the nominal model (``default``), ``low`` and ``high`` the
+    ends of the 90 % band of what a sensor reads; ``window_starts`` (W,), in s, is where windows begin.
     """
 
     log: str
@@ -147,11 +145,9 @@ class Misfit:
     Args:
         p: of residuals as odd as these under a right model with autoregressive noise; at least ``floor``.
         log, channel: where it shows most, from ``start`` to ``stop``, in s.
-        share: for each channel the share of the residual's variance that the cause explains. Where samples follow one
-            another, of the whitened residual's that those before foretell; where noise is larger for a while, of its
-            squares what that tenth of the time has too many.
-        shift: for each parameter by how many posterior sds its estimate would move if the model had the cause; empty
-            where that cannot be told.
+        share: of each channel's residual variance that the cause explains; of whitened residuals that follow one
+            another what those before foretell, of noise that is larger for a while what that tenth has too many.
+        shift: by how many posterior sds each parameter's estimate would move if the model had the cause; or empty.
         alike: how many causes the cause's words name, which explain about as much.
     """
 
@@ -194,10 +190,7 @@ class Misfit:
 
     @property
     def finding(self) -> Finding:
-        """The diagnostic: about all parameters where the cause explains much, else about those that move.
-
-        A cause that explains much may have the wrong name, and then other parameters move.
-        """
+        """The diagnostic; about all parameters where the cause explains much: under a wrong name others move."""
         moved = ", ".join(f"{name} by {self.shift[name]:+.2g} sd" for name in self.moved)
         which = "it" if self.alike == 1 else "the first of them"
         move = f"with {which} in the model the estimate would move, {moved}"
@@ -229,7 +222,6 @@ class LogReport:
     """What a log held and what was done to it; ``findings`` say it in words.
 
     Args:
-        file: its path, and the ``sha256`` of what it holds.
         rate_hz: of the control grid, which has T+1 ``samples``.
         jitter_s: largest distance of a sample period from the median one, or, over dropped rows, from a multiple of it.
         gaps: (start, stop) in s from the trajectory's first sample, without a measurement for longer than ``max_gap``.

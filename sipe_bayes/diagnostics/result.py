@@ -20,10 +20,9 @@ FLAGS = (Code.NO_EFFECT, Code.DEAD_RANGE, Code.NOT_DETERMINED, Code.MODE_AT_BOUN
 class ParameterSummary:
     """One parameter's marginal in its unit.
 
-    Quantiles are the posterior's; ``q05`` is the bound where the mode sits on a physical one. ``contraction`` is 1 - sd
-    / prior sd. A ``nuisance`` holds for one log alone. ``further`` (2,) are the ends of the discrepancy-aware 90 %
-    interval, where logs differ that of a further log; None where it cannot be said. ``known``: whether the prior alone
-    determines it well, and the logs do not say otherwise.
+    ``q05`` is the bound where the mode sits on a physical one. ``contraction`` is 1 - sd / prior sd. A ``nuisance``
+    holds for one log alone. ``further`` (2,) are the ends of the discrepancy-aware 90 % interval, where logs differ
+    that of a further log. ``known``: whether the prior alone determines it well, and the logs do not say otherwise.
     """
 
     name: str
@@ -48,15 +47,14 @@ class Calibration:
 
     Args:
         train, holdout: errors on the training and on the held-out logs.
-        findings: the one list of what the estimator, the checks and the readers noticed, in the order in which it is
-            told; ``warnings``, ``doubts`` and ``flags`` are views of it.
-        ridges: combinations that are better known than their members.
+        findings: what the estimator, the checks and the readers noticed, in the order in which it is told;
+            ``warnings``, ``doubts`` and ``flags`` are views of it.
         bands, comparison: of the held-out logs and errors; None without any.
         misfit: what the residuals look like; None where they could not be looked at.
         outside: of each training log, whether the prior gives such a one.
         noise: of each fitted channel.
-        further: theta with what the model lacks or may lack, of which the parameters' ``further`` are the intervals,
-            to first order; None where nothing can be said. ``causes`` are what it allows for.
+        further: theta with what the model lacks or may lack to first order, of which the parameters' ``further`` are
+            the intervals; None where nothing can be said. ``causes`` are what it allows for.
         mixing: of Markov chains, numbers by name: ``rhat``, ``ess``, ``acceptance``, ...; none of other methods.
         run: configuration, versions, seed and checksums, as JSON has them.
         checked: False as long as the checks of the fit have not been made.

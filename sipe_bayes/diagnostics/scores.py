@@ -2,17 +2,14 @@
 
 The SiPE paper (Mehta, Handa, Fox, Ramos 2020, https://arxiv.org/abs/2011.08985) scores accuracy_j = 1 - abs(E theta_j -
 theta*_j), which sees the mean alone. Beside it stand strictly proper scores (T. Gneiting, A. Raftery 2007, "Strictly
-Proper Scoring Rules, Prediction, and Estimation", JASA 102, https://doi.org/10.1198/016214506000001437), smallest in
-expectation for the true posterior, and for a point its plain error:
+Proper Scoring Rules, Prediction, and Estimation", JASA 102, https://doi.org/10.1198/016214506000001437), the smaller
+the better, for a point its plain error:
 
     CRPS_j = E|theta_j - theta*_j| - 1/2 E|theta_j - theta_j'|,      energy = E|theta - theta*| - 1/2 E|theta - theta'|,
 
-theta, theta' independent draws, | | Euclidean. Particles are the discrete distribution that they are, weights included.
-Otherwise CRPS_j is that of the quantiles at 400 midpoints, and the energy score from draws, without bias (C. Ferro
-2014, "Fair scores for ensemble forecasts").
-
-Mind: the prior's mean is a perfect guess of a truth at the centre of the range, and where the truth lies outside the
-support only CRPS, energy score, ``distance`` and ``noticed`` mean anything.
+theta, theta' independent draws. Particles are the discrete distribution that they are. Otherwise CRPS_j is that of the
+quantiles at 400 midpoints, and the energy score from draws, without bias (C. Ferro 2014, "Fair scores for ensemble
+forecasts"). Where the truth lies outside the support only these, ``distance`` and ``noticed`` mean anything.
 """
 
 from __future__ import annotations
@@ -94,14 +91,10 @@ class Scores:
 
 
 def score(posterior: Posterior, truth: Numbers, prior: Posterior | None = None) -> Scores:
-    """Scores of a posterior against the truth; the same posterior has the same scores.
+    """Scores of a posterior of N parameters against the truth (N,) in theta, which may lie outside [0, 1].
 
-    Warns of a truth more than a whole range away: it is most often physical values where theta is expected.
-
-    Args:
-        posterior: of N parameters.
-        truth: (N,) in theta; it may lie outside [0, 1].
-        prior: what was believed before; default what the parameters say.
+    Warns of a truth more than a whole range away, which most often holds physical values. ``prior`` is by default what
+    the parameters say.
 
     Raises:
         ValueError: for a truth of another shape, or a prior of other parameters.
@@ -114,7 +107,7 @@ def score(posterior: Posterior, truth: Numbers, prior: Posterior | None = None) 
     before = default_prior(posterior.space) if prior is None else prior
     if before.space.names != posterior.space.names:
         raise ValueError(f"prior: expected parameters {list(posterior.space.names)}, got {list(before.space.names)}")
-    error, median, outside = crps(posterior, theta), posterior.quantile(0.5).numpy(), np.abs(theta - 0.5) > 0.5
+    error, median, beyond = crps(posterior, theta), posterior.quantile(0.5).numpy(), np.abs(theta - 0.5) - 0.5
     at_bound = np.where(theta < 0, median, 1 - median) < THRESHOLDS.at_bound
     ends = {level: posterior.quantile([(1 - level) / 2, (1 + level) / 2]).numpy() for level in LEVELS}
     return Scores(
@@ -127,8 +120,8 @@ def score(posterior: Posterior, truth: Numbers, prior: Posterior | None = None) 
         contraction=tuple((1 - posterior.stddev.numpy() / before.stddev.numpy()).tolist()),
         skill_over_prior_mean=_skill(error, crps(Dirac(before.mean, posterior.space), theta)),
         skill_over_prior=_skill(error, crps(before, theta)),
-        distance=tuple(np.maximum(np.abs(theta - 0.5) - 0.5, 0.0).tolist()),
-        noticed=tuple(bool(at) if out else None for at, out in zip(at_bound, outside, strict=True)),
+        distance=tuple(np.maximum(beyond, 0.0).tolist()),
+        noticed=tuple(bool(at) if out else None for at, out in zip(at_bound, beyond > 0, strict=True)),
     )
 
 
@@ -138,8 +131,7 @@ def crps(posterior: Posterior, truth: Numbers) -> FloatArray:
     if isinstance(posterior, Dirac | Particles):
         points, weights = _points(posterior)
     else:
-        points = posterior.quantile((np.arange(400) + 0.5) / 400).numpy()
-        weights = np.full(len(points), 1 / len(points))
+        points, weights = posterior.quantile((np.arange(400) + 0.5) / 400).numpy(), np.full(400, 1 / 400)
     pairs = zip(points.T, theta, strict=True)  # Cramer's distance to the point: half of the energy distance's square
     return np.array([0.5 * scipy.stats.energy_distance(x, [true], weights) ** 2 for x, true in pairs])
 
@@ -191,5 +183,4 @@ def _checked(posterior: Posterior, truth: Numbers) -> FloatArray:
 
 
 def _skill(error: FloatArray, reference: FloatArray) -> float | None:
-    worst = float(reference.mean())
-    return None if worst < 1e-12 else 1 - float(error.mean()) / worst
+    return None if reference.mean() < 1e-12 else 1 - float(error.mean()) / float(reference.mean())

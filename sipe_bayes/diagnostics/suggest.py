@@ -1,15 +1,14 @@
 """Which experiment next? Command sequences ranked by what they are expected to tell of the parameters asked for.
 
-At theta the simulation of planned commands is linearised as ``laplace`` would linearise the log, initial states unknown
-and marginalised, noise as given; what is left is the Fisher information I(theta) = J' V^-1 J of the parameters alone.
-With the present knowledge, a normal of precision P, the experiment leaves the covariance (P + I)^-1: D. Lindley 1956,
-"On a measure of the information provided by an experiment" (https://doi.org/10.1214/aoms/1177728069). The score of a
-candidate is the A-criterion (K. Chaloner, I. Verdinelli 1995, https://doi.org/10.1214/ss/1177009939) in sds: the
-contraction of each parameter's sd, averaged over draws of theta and over the parameters asked for.
+At theta the simulation of planned commands is linearised, initial states marginalised, noise as given; what is left is
+the Fisher information I(theta) = J' V^-1 J. With the present knowledge, a normal of precision P, the experiment leaves
+the covariance (P + I)^-1 (D. Lindley 1956, "On a measure of the information provided by an experiment",
+https://doi.org/10.1214/aoms/1177728069). The score is the A-criterion (K. Chaloner, I. Verdinelli 1995,
+https://doi.org/10.1214/ss/1177009939) in sds: the contraction of each parameter's sd, averaged over draws of theta and
+over the parameters asked for. At a draw where a candidate diverges it tells nothing.
 
-A candidate that diverges at a draw counts there as telling nothing. Those that take a measured quantity further than
-logs went, by more than half of what that was in all, come after those that do not and tell half as much as the best at
-least: whether the machine may go there is not known here.
+Candidates that take a measured quantity further than logs went, by more than half of what that was in all, come after
+those that do not and tell half as much as the best at least: whether the machine may go there is not known here.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ import scipy.signal
 import torch
 
 from sipe_bayes.core.arrays import BoolArray, FloatArray
-from sipe_bayes.core.parameters import ParameterSpace
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.likelihood import UNIFORM_PRECISION, Noise, Segments, bind
 from sipe_bayes.posterior import Posterior
@@ -45,8 +43,8 @@ class Plan:
 class Suggestion:
     """A plan, the expected contraction of each parameter's sd, and the mean over those asked for (``score``).
 
-    ``reach`` is the lowest and highest value of each channel over the draws, of which so many ``diverged``; ``strays``
-    are the channels that go far beyond what logs reached.
+    ``reach`` is the lowest and highest value of each channel over the draws, ``diverged`` the number of these that did,
+    ``strays`` the channels that go far beyond what logs reached.
     """
 
     plan: Plan
@@ -75,36 +73,34 @@ def rank(
 ) -> list[Suggestion]:
     """Plans, the most telling first of those that do not stray, then the others.
 
-    The log would be fitted with ``likelihood``; ``noise`` (C,) is that of the fitted channels. The gain is averaged
-    over ``draws`` of what is ``known``, the prior or the posterior so far. ``names`` of the parameters that count are
-    by default all that are not of one log. ``reached`` (C, 2), the lowest and highest value of each channel in logs, is
-    by default none, of which nothing strays.
+    The log would be fitted with ``likelihood`` beside ``noise`` (C,) of the fitted channels. The gain is averaged over
+    ``draws`` of what is ``known``, the prior or the posterior so far, and over the parameters ``names``, by default all
+    that are not of one log. ``reached`` (C, 2), the lowest and highest value of each channel in logs, is by default
+    none, of which nothing strays.
 
     Raises:
         ValueError: for unknown names, and for those of one log.
     """
     space = known.space
-    unknown = [name for name in names if name not in space.names]
-    if unknown:
-        raise ValueError(f"names: no parameter {unknown[0]!r}; there are {', '.join(space.names)}")
-    old = [name for name in names if space[space.index(name)].log is not None]
-    if old:
-        raise ValueError(f"names: {old[0]!r} is of a log that is there already; a new one tells nothing of it")
+    for name in names:
+        if name not in space.names:
+            raise ValueError(f"names: no parameter {name!r}; there are {', '.join(space.names)}")
+        if space[space.index(name)].log is not None:
+            raise ValueError(f"names: {name!r} is of a log that is there already; a new one tells nothing of it")
     wanted = [j for j, p in enumerate(space) if (p.name in names if names else p.log is None)]
     thetas = known.sample((draws,), generator=torch.Generator().manual_seed(seed)).numpy()
-    nothing, ranked = np.zeros((len(space), len(space))), []
-    start, channels = simulator.default_state(), simulator.environment.channels
+    start, channels, ranked = simulator.default_state(), simulator.environment.channels, []
     precision = np.asarray(np.linalg.inv(known.covariance.numpy() + 1e-12 * np.eye(len(space))), np.float64)
     for plan in plans:
         gains = [information(simulator, likelihood, plan, noise, theta) for theta in thetas]
+        gain = contraction(precision, [np.zeros_like(precision) if gain is None else gain for gain in gains])
         lost = sum(gain is None for gain in gains)
-        gain = contraction(precision, [nothing if gain is None else gain for gain in gains])
         motion = simulator.rollout(thetas, plan.actions[None], start[None], plan.dt, [plan.name] * draws)
         seen = np.where(motion.valid[..., None], motion.observations, np.nan)
         reach = np.stack([np.nanmin(seen, axis=(0, 1)), np.nanmax(seen, axis=(0, 1))], axis=1)
         far = [] if reached is None else np.flatnonzero(_strays(reach, reached)).tolist()
         each = dict(zip(space.names, gain.tolist(), strict=True))
-        ends = {channel: (low, high) for channel, (low, high) in zip(channels, reach.tolist(), strict=True)}
+        ends = dict(zip(channels, map(tuple, reach.tolist()), strict=True))
         ranked.append(Suggestion(plan, float(gain[wanted].mean()), each, ends, lost, tuple(channels[c] for c in far)))
     worth = 0.5 * max((one.score for one in ranked), default=0.0)
     return sorted(ranked, key=lambda one: (bool(one.strays) or one.score < worth, -one.score))
@@ -126,15 +122,10 @@ def information(
     linearisation = windows.linearise(theta, windows.no_starts())
     if not linearisation.valid:
         return None
-    normal = windows.moments(linearisation).normal(noise)
-    return _of_shared(windows.eliminate(normal, windows.num_theta).precision, simulator.space)
-
-
-def _of_shared(plain: FloatArray, space: ParameterSpace) -> FloatArray:
-    """Information (N, N) with a new value, marginalised, in place of each nuisance of one log.
-
-    The simulation takes the mean of K logs for it, whose uniform prior is that of K values K times as uncertain.
-    """
+    normal, space = windows.moments(linearisation).normal(noise), simulator.space
+    plain = windows.eliminate(normal, windows.num_theta).precision
+    # in place of each nuisance of one log a new value, marginalised: the simulation takes the mean of K logs for it,
+    # whose uniform prior is that of K values K times as uncertain
     own, shared = ([j for j, p in enumerate(space) if (p.log is None) == common] for common in (False, True))
     logs = Counter(space[j].targets for j in own)
     loose = np.array([UNIFORM_PRECISION / logs[space[j].targets] for j in own])
@@ -179,11 +170,11 @@ def limits(simulator: Simulator, recorded: FloatArray | None = None) -> FloatArr
 def generate(
     count: int, duration: float, dt: float, bounds: FloatArray, band: tuple[float, float], seed: int = 0
 ) -> list[Plan]:
-    """So many plans of all kinds and sizes in turn.
+    """So many plans of all kinds and sizes in turn, of commands within ``bounds`` (A, 2), each held for ``dt`` s.
 
     Chirps go from one end of the ``band``, in Hz, to the other by equal factors in equal times; sums of at most ten
-    sines have random phases, at multiples of 1 / ``duration``. A plan ends as it began, within a tenth of its duration
-    in s, at zero or the middle of ``bounds`` (A, 2), the lowest and highest commands, each held for ``dt`` s.
+    sines have random phases, at multiples of 1 / ``duration`` in s. In 5 % of it
+    a plan rises from, and falls to, the command that is nearest to zero.
 
     Raises:
         ValueError: for a band that the duration or dt cannot hold.
@@ -209,9 +200,8 @@ def generate(
 def _wave(kind: str, time: FloatArray, low: float, high: float, rng: np.random.Generator) -> FloatArray:
     """One actuator's wave (T,) within -1 and 1."""
     if kind.startswith("chirp"):
-        ends = (low, high) if kind.endswith("up") else (high, low)
-        swept = scipy.signal.chirp(time, ends[0], time[-1], ends[1], "logarithmic", rng.uniform(0, 360))
-        return np.asarray(swept)
+        begin, end = (low, high) if kind.endswith("up") else (high, low)
+        return np.asarray(scipy.signal.chirp(time, begin, time[-1], end, "logarithmic", rng.uniform(0, 360)))
     multiples = np.arange(np.ceil(low * time[-1]), np.floor(high * time[-1]) + 1)
     if not len(multiples):  # a narrow band
         multiples = np.array([np.sqrt(low * high) * time[-1]])

@@ -101,6 +101,28 @@ class Task(Environment):
         """The parameters."""
         return self.parameters
 
+    def row(self) -> dict[str, object]:
+        """What `sipe envs` prints of it among others, as JSON has it."""
+        return {
+            "name": self.name,
+            "id": f"sipe/{self.name}-v0",
+            "summary": self.summary,
+            "parameters": len(self.space),
+            "observations": len(self.channels),
+            "actions": self.num_actions,
+            "episode_steps": self.episode_steps,
+            "solved_by": self.solved.measure,
+            "solved_at": self.solved.threshold,
+            "reproduces": self.reference,
+        }
+
+    def to_dict(self) -> dict[str, object]:
+        """Its row, with the parameters, channels and variants in full."""
+        kept = ("name", "unit", "default", "low", "high", "description")
+        parameters = [{key: getattr(p, key) for key in kept} | {"writes": list(p.targets)} for p in self.space]
+        variants = {v: self.theta(v).round(6).tolist() for v in VARIANTS}
+        return {**self.row(), "observation": list(self.channels), "parameters": parameters, "variants": variants}
+
     @abstractmethod
     def initial_states(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray | None]:
         """Starting states (count, S) and goals (count, G), if the task has goals."""

@@ -1,18 +1,16 @@
 r"""One linear model of the logs at an estimate: parameters, what they may lack, and what differs between logs.
 
-The columns beside those of the N parameters and of the initial states are probes: what each extension of the table
-would do to every sample (``structure.probes``), and what numbers with a tolerance would. In
+The columns beside those of the N parameters and of the initial states are probes, what each extension would do to every
+sample (``structure.probes``). In
 
 .. math:: r = J_\theta \delta + E b + J_x x + \varepsilon
 
-initial states are eliminated and theta is projected out, so that everything that is asked of the probes (which fit, how
-large they are, how far they move theta) is small linear algebra: S, the information of b, and q, its score.
+initial states are eliminated and theta is projected out; S, the information of b, and q, its score, are left.
 
-What a model lacks is a smooth force: what it leaves of the whitened samples remembers itself. With their integrated
-autocorrelation time as a factor on the variance of the noise scores at low frequencies have the variance that they
-show, as in the adjustment of a composite likelihood (R. Chandler, S. Bate, "Inference for clustered data using the
-independence loglikelihood", Biometrika 94 (2007), 167-183, https://doi.org/10.1093/biomet/asm015); a factor for each
-channel instead of a matrix.
+What a model lacks is a smooth force: what it leaves of the whitened samples remembers itself. Their integrated
+autocorrelation time, a factor on the noise's variance, gives scores at low frequencies the variance that they show, as
+in the adjustment of a composite likelihood (R. Chandler, S. Bate, "Inference for clustered data using the independence
+loglikelihood", Biometrika 94 (2007), 167-183, https://doi.org/10.1093/biomet/asm015); by channel, not by a matrix.
 """
 
 from __future__ import annotations
@@ -39,12 +37,10 @@ _PRESSED = 1e-6  # of the range: a parameter that the search left on its bound
 
 def steps_of(windows: BoundLikelihood, placed: Sequence[Placed]) -> int:
     """Control steps of the windows that are probed: so many that probes take about half a million physics steps."""
-    most = 4000
     if isinstance(windows.simulator, CallableSimulator):
-        return most
+        return 4000
     each = max(probes_cost(windows, placed) / len(windows.trajectories), 1.0)
-    skip = windows.simulator.physics_steps(float(windows.dt.min()))[0]
-    return int(min(most, 5e5 / (each * skip)))
+    return int(min(4000, 5e5 / (each * windows.simulator.physics_steps(float(windows.dt.min()))[0])))
 
 
 @dataclass(frozen=True)
@@ -81,12 +77,10 @@ class AugmentedModel:
 
     Args:
         windows: the logs, W windows of C channels.
-        theta: (N,) the estimate.
-        noise: (C,) there.
+        theta, noise: (N,) the estimate, and (C,) there.
         starts, prior: (W, D) of the windows, default the best; and of the fit, default flat.
         lin: at theta and starts, where it is known.
-        tell, kept: called with what is being done; keeps what extensions do.
-        placed: extensions that are probed; default all that the registry has.
+        tell, kept, placed: see ``effects``; by default extensions are all of the registry.
 
     Raises:
         DivergesError: where the simulation diverges at theta.
@@ -129,14 +123,14 @@ class AugmentedModel:
         self.jacobian = np.concatenate([lin.jacobian[..., :n], *changes, lin.jacobian[..., n:]], axis=-1)
         self.count, self.coloured = n + len(self.probes), bool((noise.tau > 0).any())
         self.inner, self.pull = prior.precision + FLAT_PRECISION * np.eye(n), prior.pull(theta)
-        self._trades = np.array([probe.trade or (0.0,) * n for probe in self.probes]).reshape(-1, n)
+        self._trades = np.array([probe.trade for probe in self.probes]).reshape(-1, n)
         self.rows = WhitenedRows(self.jacobian, windows)
         self.seen = AtNoise(self, noise)
 
     def estimate_noise(self, before: Noise, sizes: FloatArray) -> Noise:
-        """The noise where the probes have sizes (K,), theta and the starts being free to follow; ``before`` another."""
+        """The noise where probes have sizes (K,), all else being free to follow; searched from ``before``."""
         n, windows = self.windows.num_theta, self.windows
-        own = np.concatenate([self.jacobian[..., :n], self.jacobian[..., self.count :]], axis=-1)
+        own = np.delete(self.jacobian, np.s_[n : self.count], axis=-1)
         lin = Linearisation(self.residual - self.jacobian[..., n : self.count] @ sizes, own, True)
         pulls = windows.pulls(self.inner, self.pull, self.starts, AtNoise(self, before, sizes).free)
         noise = windows.estimate_noise(windows.moments(lin), before, pulls, self.coloured)
@@ -148,21 +142,17 @@ class AugmentedModel:
 
     @property
     def scatter(self) -> Noise | None:
-        """White noise of the samples' scatter in channels whose fit takes far more for noise; None without such.
-
-        From 1.4 times the scatter on noise hides as much again.
-        """
+        """White noise of the samples' scatter in channels whose fit takes far more for noise; None without such."""
         noise, scatter = self.noise, self.windows.level.sd
-        holds = (scatter * 1.4 < noise.sd) & ~self.rests(scatter)
+        holds = (scatter * 1.4 < noise.sd) & ~self.rests(scatter)  # from there on noise hides as much again
         return Noise(np.where(holds, scatter, noise.sd), np.where(holds, 0.0, noise.tau)) if holds.any() else None
 
     def fitted(self, columns: IntArray, before: Noise | None = None) -> tuple[float, FloatArray]:
         """The log-likelihood in nats with some probes (J,) at their best sizes (J,), and these, at the best noise.
 
-        before: from which that noise is searched; default the fit's.
+        That is searched from ``before``, by default from the fit's.
         """
-        before = self.noise if before is None else before
-        n, windows = self.windows.num_theta, self.windows
+        before, n, windows = before or self.noise, self.windows.num_theta, self.windows
         every = np.concatenate([np.arange(n), n + columns, np.arange(self.count, self.jacobian.shape[-1])])
         moments = windows.moments(Linearisation(self.residual, self.jacobian[..., every], True))
         normal, count = moments.normal(before), n + len(columns)
@@ -173,13 +163,12 @@ class AugmentedModel:
         noise = windows.estimate_noise(moments, before, windows.pulls(precision, pull, self.starts), True)
         normal = moments.normal(noise)
         arrow = windows.eliminate(normal, count, self.starts)
-        total = arrow.gradient + pull
-        step = np.linalg.solve(arrow.precision + precision, total)
-        square = float(normal[:, -1, -1].sum()) - arrow.explained - float(total @ step)
+        step = np.linalg.solve(arrow.precision + precision, arrow.gradient + pull)
+        square = float(normal[:, -1, -1].sum()) - arrow.explained - float((arrow.gradient + pull) @ step)
         return -0.5 * (moments.log_determinant(noise) + square), np.asarray(step[n:], float)
 
     def fitted_at_noise(self, columns: IntArray) -> tuple[float, FloatArray]:
-        """The same at the noise of the fit, beside the level without probes: a score test, without a simulation."""
+        """The same at the noise of the fit, less the level without probes: a score test."""
         made = self.seen.projected
         information, score = made.information[np.ix_(columns, columns)], made.score[columns]
         sizes = np.linalg.solve(information + _FAINT * np.diag(made.whole[columns]), score)
@@ -191,10 +180,7 @@ class AugmentedModel:
 
 
 class AtNoise:
-    """The normal equations of an ``AugmentedModel`` beside a noise (C,), at sizes (K,) of its probes, by default none.
-
-    By the sizes parameters that the search left on a bound may come away from it.
-    """
+    """The normal equations of an ``AugmentedModel`` beside a noise (C,), at sizes (K,) of its probes, or at none."""
 
     def __init__(self, logs: AugmentedModel, noise: Noise, sizes: FloatArray | None = None) -> None:
         self.logs, self.noise = logs, noise
@@ -212,7 +198,7 @@ class AtNoise:
 
     @functools.cached_property
     def free(self) -> BoolArray:
-        """(N,): which parameters are not held by a bound that the search left them on."""
+        """(N,): which parameters are not held by a bound that the search left them on; by ``sizes`` some come away."""
         logs, n = self.logs, self.logs.windows.num_theta
         at_low, at_high = logs.theta <= _PRESSED, logs.theta >= 1 - _PRESSED
         if not (at_low | at_high).any():
@@ -229,18 +215,15 @@ class AtNoise:
         logs, arrow, n = self.logs, self.arrow, self.logs.windows.num_theta
         covariance, among = np.zeros((n, n)), np.ix_(self.free, self.free)
         covariance[among] = np.linalg.inv((arrow.precision[:n, :n] + logs.inner)[among])
-        base = covariance @ (arrow.gradient[:n] + logs.pull)
-        cross = arrow.precision[:n, n:]
-        answer = covariance @ cross
-        information = arrow.precision[n:, n:] - cross.T @ answer
-        score = arrow.gradient[n:] - cross.T @ base
-        pull = arrow.gradient[:n] + logs.pull - cross @ self.sizes
+        pull, cross = arrow.gradient[:n] + logs.pull, arrow.precision[:n, n:]
+        base, answer = covariance @ pull, covariance @ cross
+        information, score = arrow.precision[n:, n:] - cross.T @ answer, arrow.gradient[n:] - cross.T @ base
         own = np.maximum(np.diag(arrow.precision[:n, :n] + logs.inner), 1e-300)
-        pressed = np.where(self.free, 0.0, pull / own)
+        pressed = np.where(self.free, 0.0, (pull - cross @ self.sizes) / own)
         return Projected(information, score, np.diag(arrow.precision)[n:], answer, covariance, base, pressed)
 
     def left(self, sizes: FloatArray) -> FloatArray:
-        """What is left of the residual (W, L, C) where the probes have sizes (K,) and all else follows."""
+        """The residual (W, L, C) that is left where the probes have sizes (K,) and all else follows."""
         logs, step = self.logs, np.concatenate([self.projected.base - self.projected.answer @ sizes, sizes])
         moved = logs.jacobian[..., : logs.count] @ step
         turned = np.einsum("wlcd,wd->wlc", logs.jacobian[..., logs.count :], self.arrow.blocks(step))
@@ -249,16 +232,11 @@ class AtNoise:
     @functools.cached_property
     def discounted(self) -> AtNoise:
         """The same beside a noise whose samples tell no more than they do beside those around them."""
-        left = self.logs.windows.whitened(self.left(self.sizes)[None], self.noise)
-        memory = np.array([_memory(z[0]) for z in left])
+        memory = [
+            max(1.0, float(emcee.autocorr.integrated_time(z[0], tol=0)[0])) if z.shape[1] >= 50 and z.std() else 1.0
+            for z in self.logs.windows.whitened(self.left(self.sizes)[None], self.noise)
+        ]
         return AtNoise(self.logs, Noise(self.noise.sd * np.sqrt(memory), self.noise.tau), self.sizes)
-
-
-def _memory(z: FloatArray) -> float:
-    """Integrated autocorrelation time of z (n,), by emcee; at least one, and of fewer than 50 samples one."""
-    if len(z) < 50 or not z.std():
-        return 1.0
-    return max(1.0, float(emcee.autocorr.integrated_time(z, tol=0)[0]))
 
 
 class WhitenedRows:
@@ -269,8 +247,13 @@ class WhitenedRows:
     """
 
     def __init__(self, jacobian: FloatArray, windows: BoundLikelihood) -> None:
-        self.shape, self.num_theta = jacobian.shape[:3], jacobian.shape[-1] - windows.num_start
-        self.sequences = windows.sequences
+        self.num_theta, self.sequences = jacobian.shape[-1] - windows.num_start, windows.sequences
+        self._shape = w, length, channels = jacobian.shape[:3]
+        place = np.arange(w * channels * length).reshape(w, channels, length).swapaxes(0, 1).reshape(channels, -1)
+        # rows (W, C, L) of observed samples, and of those before them, where there are such
+        self._place = np.concatenate([place[c, s.index] for c, s in enumerate(self.sequences)])
+        self._linked = np.concatenate([s.previous for s in self.sequences]) >= 0
+        self._previous = np.concatenate([place[c, s.previous] for c, s in enumerate(self.sequences)])[self._linked]
         self._crosses = self._placed([s.crosses.astype(float) for s in self.sequences]) > 0
         self._rows, self._before = self._both(jacobian)
 
@@ -289,16 +272,10 @@ class WhitenedRows:
         return np.einsum("wrk,wrs->ks", theta, white, optimize=True), force
 
     def _whitened(self, residuals: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Rows (W, C L, N + K), (W, C L, 2 D) of [x_w | x_{w-1}], and those of residuals (W, L, C, S) (W, C L, S).
-
-        Zero where nothing was observed.
-        """
-        n, weights, lags = self.num_theta, [], []
-        for s, sd, tau in zip(self.sequences, noise.sd.tolist(), noise.tau.tolist(), strict=True):
-            a = s.coefficients(tau)
-            weights.append(1 / (sd * np.sqrt(1 - a**2)))
-            lags.append(a * weights[-1])
-        weight, lag = self._placed(weights), self._placed(lags)
+        """Rows (W, C L, N + K), (W, C L, 2 D) of [x_w | x_{w-1}], and those of residuals (W, L, C, S): (W, C L, S)."""
+        n, memory = self.num_theta, [s.coefficients(tau) for s, tau in zip(self.sequences, noise.tau, strict=True)]
+        weights = [1 / (sd * np.sqrt(1 - a**2)) for sd, a in zip(noise.sd, memory, strict=True)]
+        weight, lag = self._placed(weights), self._placed([a * x for a, x in zip(memory, weights, strict=True)])
         inside = np.where(self._crosses, 0.0, lag)
         theta = weight * self._rows[..., :n] - lag * self._before[..., :n]
         own = weight * self._rows[..., n:] - inside * self._before[..., n:]
@@ -308,26 +285,18 @@ class WhitenedRows:
         return theta, np.concatenate([own, earlier], axis=-1), weight * left - lag * before
 
     def _both(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Observed rows (W, C L, q) of values (W, L, C, q), and what is in the row before each."""
-        windows, length, channels, width = values.shape
-        flat = np.moveaxis(values, 2, 0).reshape(channels, windows * length, width)
+        """Observed rows (W, C L, q) of values (W, L, C, q), and what is in the row before each; else zero."""
+        windows, length, channels = self._shape
+        flat = np.moveaxis(values, 2, 1).reshape(windows * channels * length, -1)
         rows, before = np.zeros((2, *flat.shape))
-        for c, s in enumerate(self.sequences):
-            linked = s.previous >= 0
-            rows[c, s.index] = flat[c, s.index]
-            before[c, s.index[linked]] = flat[c, s.previous[linked]]
-        return self._by_window(rows), self._by_window(before)
+        rows[self._place] = flat[self._place]
+        before[self._place[self._linked]] = flat[self._previous]
+        rows, before = (one.reshape(windows, channels * length, flat.shape[1]) for one in (rows, before))
+        return rows, before
 
     def _placed(self, values: list[FloatArray]) -> FloatArray:
         """Numbers of each channel's samples at their rows (W, C L, 1), zero where nothing was observed."""
-        windows, length, channels = self.shape
-        out = np.zeros((channels, windows * length))
-        for row, s, own in zip(out, self.sequences, values, strict=True):
-            row[s.index] = own
-        return self._by_window(out)
-
-    def _by_window(self, rows: FloatArray) -> FloatArray:
-        """(W, C L, q) of (C, W L, q)."""
-        windows, length, channels = self.shape
-        turned = np.moveaxis(rows.reshape(channels, windows, length, -1), 0, 1)
-        return turned.reshape(windows, channels * length, -1)
+        windows, length, channels = self._shape
+        out = np.zeros(windows * channels * length)
+        out[self._place] = np.concatenate(values)
+        return out.reshape(windows, -1, 1)

@@ -1,8 +1,8 @@
 """Which extensions a fit asks for: score tests against the residuals, all else free to follow.
 
-At the estimate, with parameters and initial states free to follow (linearised), the effect of an extension along its
-probes has a best size and a gain in log-likelihood (C. R. Rao 1948, https://doi.org/10.1017/S0305004100023987). What a
-model lacks has made the noise larger and slower than it is, so the noise is estimated anew with each extension.
+At the estimate the effect of an extension along its probes has a best size and a gain in log-likelihood (C. R. Rao
+1948, https://doi.org/10.1017/S0305004100023987). The noise, which what a model lacks has made larger and slower, is
+estimated anew with each.
 """
 
 from __future__ import annotations

@@ -1,14 +1,13 @@
 r"""How far theta may be off, for what the model lacks or may lack: the discrepancy-aware posterior.
 
-In the linear model of ``structure.augmented`` three things are unknown beside theta, each with a prior whose scale is
-integrated by its evidence.
+In the linear model of ``structure.augmented`` three things are unknown beside theta:
 
-- *What is missing.* Sizes of extensions' probes are single effects, and all of them a little
-  (``structure.single_effects``): what extensions would do spans the discrepancy between machine and model (M. Kennedy,
-  A. O'Hagan, "Bayesian calibration of computer models", 2001, https://doi.org/10.1111/1467-9868.00294).
+- *What is missing.* What extensions would do spans the discrepancy between machine and model (M. Kennedy, A. O'Hagan,
+  "Bayesian calibration of computer models", 2001, https://doi.org/10.1111/1467-9868.00294); the sizes of their probes
+  have the prior of ``structure.single_effects``.
 - *Numbers that no machine has exactly* (``structure.tolerances``): normal around the model's, of the sd that is stated.
-- *What differs between logs*, or pieces of one that were moved differently. Log g asks for theta_g ~ N(mu, t^2 C_g),
-  C_g what it leaves unknown by itself, with evidence from Cochran's Q of nu degrees of freedom
+- *What differs between logs*, or pieces of one. Log g asks for theta_g ~ N(mu, t^2 C_g), C_g what it leaves unknown by
+  itself, with evidence from Cochran's Q of nu degrees of freedom
 
   .. math:: p(Q \mid t) \propto (1 + t^2)^{-\nu / 2} e^{-Q / (2 (1 + t^2))},
 
@@ -17,17 +16,14 @@ integrated by its evidence.
 
 Deviations:
 
-- The noise is estimated anew with the effects that are seen, in turns: what a model lacks made it larger and slower.
-  Where the fit takes far more for noise than samples scatter by, turns begin at that scatter as well, and what ends at
-  the higher likelihood counts: slow noise passes for slow forces.
-- Columns that theta imitates but for a twentieth of their information are not asked of the logs: at that level the
-  linearisation of dry friction is no better. With a tolerance they keep it, without one they are left out.
-- How much of what is moved to first order is moved in truth is normal around all of it, of sd one half, and not
-  negative: a linearisation is right to about that where effects are large.
+- The noise is estimated anew with the effects that are seen, in turns; where the fit takes far more for noise than
+  samples scatter by, also from that scatter on, and the higher likelihood counts: slow noise passes for slow forces.
+- Columns that theta imitates but for a twentieth of their information, to which linearised dry friction is right, are
+  not asked of the logs: with a tolerance they keep it, without one they are left out.
+- The share of a first-order move that is made in truth is normal around one, of sd one half, and not negative.
 - A number with a tolerance that the logs do not show moves theta only where something else is more likely missing than
-  not; elsewhere it is named (``contributions``), with what it would move.
-- A delay or lag that takes from a parameter what it adds moves theta by the root of its size (``structure.probes``);
-  where all are at work nothing is traded: the root of a small size is not small.
+  not; elsewhere it is named (``contributions``).
+- A trade (``structure.probes``) moves theta by the root of its size; where all are at work nothing is traded.
 """
 
 from __future__ import annotations
@@ -55,10 +51,9 @@ _ENDS = (0.05, 0.95)  # of the intervals that are printed
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """What a model may lack, at its sizes to first order, by the linear model beside the noise that is left (``at``).
+    """What a model may lack, to first order, by the linear model beside the noise that is left (``at``).
 
-    The logs are asked for the sizes of the probes ``usable`` (R,), of which ``effects`` are; ``known`` are the numbers
-    with a tolerance, ``spread`` says by how much logs differ.
+    ``effects`` are of the probes ``usable`` (R,); ``known`` are numbers with a tolerance, ``spread`` is of logs.
     """
 
     at: AtNoise
@@ -91,12 +86,14 @@ class Discrepancy:
         before, after = (np.diag(at.projected.covariance) for at in (self.at.logs.seen, self.at))
         both = (before > 0) & (after > 0)  # else a bound holds the parameter
         stretch = np.sqrt(np.where(both, after / np.where(both, before, 1.0), 1.0))
-        generator = torch.Generator().manual_seed(int(random.integers(2**31)))
-        if isinstance(posterior, GaussianMixture):
-            theta = _before_the_cube(posterior, stretch).sample((_DRAWS,), generator=generator).numpy()
+        if isinstance(posterior, GaussianMixture):  # before the cube cuts it off, each component as probable as before
+            covariances = posterior.covariances.numpy() * np.outer(stretch, stretch)
+            log_weights = posterior.log_weights + posterior.log_masses
+            wider = GaussianMixture(log_weights, posterior.means, covariances, posterior.space).of_masses()
+            theta = _draws(wider, random)
         else:
             middle = posterior.mean.numpy()
-            theta = middle + stretch * (posterior.sample((_DRAWS,), generator=generator).numpy() - middle)
+            theta = middle + stretch * (_draws(posterior, random) - middle)
         apart = self.spread.draws(len(theta), random) * np.sqrt(np.maximum(after, 0.0))
         return np.asarray(theta + apart * random.standard_normal(theta.shape))
 
@@ -107,12 +104,12 @@ class Discrepancy:
 
     def contributions(self) -> list[Contribution]:
         """What each number with a tolerance adds to what is not known of theta."""
-        probes, answer = self.at.logs.probes, self.at.projected.answer
-        sds, out = np.sqrt(np.diag(self.known.covariance)), []
-        for k, sd in zip(self.known.columns.tolist(), sds.tolist(), strict=True):
-            probe, share = probes[k], self.tolerances.of(probes[k])
-            left, off = sd / abs(share * probe.whole), probe.extension.off(probe.site, share)
-            out.append(Contribution(probe, off, -answer[:, k] * math.copysign(sd, probe.whole), left))
+        out = []
+        for k, sd in zip(self.known.columns, np.sqrt(np.diag(self.known.covariance)).tolist(), strict=True):
+            probe = self.at.logs.probes[k]
+            share, shift = self.tolerances.of(probe), -self.at.projected.answer[:, k] * math.copysign(sd, probe.whole)
+            off = probe.placed.extension.off(probe.placed.site, share)
+            out.append(Contribution(probe, off, shift, sd / abs(share * probe.whole)))
         return out
 
     @property
@@ -143,10 +140,9 @@ def parts_of(windows: BoundLikelihood) -> list[tuple[str, IntArray]]:
 
 @dataclass(frozen=True)
 class Contribution:
-    """What a number with a tolerance adds, that a probe changes.
+    """What a number with a tolerance adds, that a probe changes, and a ``sentence`` of what it is where it is off.
 
-    ``sentence`` is what the model has wrong where it is off by its tolerance. Theta has a ``shift`` (N,) where it is an
-    sd larger, by its tolerance and by what the logs tell of it; ``left`` is that sd as a share of its tolerance.
+    Theta has a ``shift`` (N,) where it is an sd larger than the logs tell; ``left`` is that sd over the tolerance.
     """
 
     probe: Probe
@@ -164,17 +160,18 @@ def draw_differing(posterior: Posterior, logs: Sequence[LogEstimate], seed: int)
     middle, random = posterior.mean.numpy(), np.random.default_rng(seed)
     scores = [log.information @ (log.mean - middle) for log in logs]
     apart = Spread.between([log.information for log in logs], scores).draws(_DRAWS, random)
+    theta = _draws(posterior, random)
+    return _holding(theta + apart * posterior.stddev.numpy() * random.standard_normal(theta.shape), posterior)
+
+
+def _draws(posterior: Posterior, random: np.random.Generator) -> FloatArray:
     generator = torch.Generator().manual_seed(int(random.integers(2**31)))
-    theta = posterior.sample((len(apart),), generator=generator).numpy()
-    theta = theta + apart * posterior.stddev.numpy() * random.standard_normal(theta.shape)
-    return _holding(theta, posterior)
+    return np.asarray(posterior.sample((_DRAWS,), generator=generator).numpy())
 
 
 def _holding(theta: FloatArray, posterior: Posterior) -> Particles:
-    """Draws (M, N), folded into the cube, each parameter's mapped so that its 90 % interval holds the posterior's.
-
-    What lies beyond a bound by so much lies as far within: by that much at least the linear model is wrong.
-    """
+    """Draws (M, N), each parameter's mapped so that its 90 % interval holds the posterior's."""
+    # what lies beyond a bound by so much lies as far within: by that much at least the linear model is wrong
     theta = np.clip(np.where(theta > 1, 2 - theta, np.abs(theta)), 0, 1)
     inner = posterior.quantile(torch.tensor(_ENDS, dtype=torch.float64)).numpy()
     for j, (low, high) in enumerate(inner.T):
@@ -224,10 +221,11 @@ def _asked(at: AtNoise) -> BoolArray:
 def _effects(at: AtNoise, sds: FloatArray) -> tuple[IntArray, Effects | None]:
     """The probes that may be missing, and what is told of them beside numbers of known sds (K,)."""
     probes, made = at.logs.probes, at.projected
-    able = [not probe.by_log and not (probe.is_step and sd) for probe, sd in zip(probes, sds, strict=True)]
+    able = [not probe.placed.by_log and not (probe.is_step and sd) for probe, sd in zip(probes, sds, strict=True)]
     usable = np.flatnonzero(_asked(at) & np.array(able, bool))
-    known = Known.of(at, sds)
-    information, score = known.without(made.information, made.score)
+    known = Known.of(at, sds)  # and integrated out
+    information = made.information - known.cross.T @ known.covariance @ known.cross
+    score = made.score - known.cross.T @ known.mean
     # not those that are the same as a number with a tolerance
     usable = usable[np.diag(information)[usable] > 1e-3 * np.diag(made.information)[usable]]
     if not len(usable):
@@ -251,17 +249,13 @@ class Known:
 
     @classmethod
     def of(cls, at: AtNoise, sds: FloatArray) -> Known:
-        """With sds (K,) in sizes, zero of what has no tolerance."""
+        """Of sds (K,) in sizes, zero without a tolerance."""
         columns, made = np.flatnonzero(sds), at.projected
         told = _asked(at)[columns]
         cross = np.where(told[:, None], made.information[columns], 0.0)
         own = np.where(np.outer(told, told), cross[:, columns], 0.0)
         covariance = np.linalg.inv(own + np.diag(1 / sds[columns] ** 2))
         return cls(columns, cross, covariance, covariance @ np.where(told, made.score[columns], 0.0))
-
-    def without(self, information: FloatArray, score: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Information (K, K) and score (K,) of all probes with these integrated out."""
-        return information - self.cross.T @ self.covariance @ self.cross, score - self.cross.T @ self.mean
 
     def draws(self, sizes: FloatArray, random: np.random.Generator) -> FloatArray:
         """(M, K) of them alone, beside sizes (M, K) of others."""
@@ -276,7 +270,7 @@ class Known:
 class Spread:
     """By how much logs differ: how many times what a log leaves unknown by itself (T,), with probabilities (T,).
 
-    ``alone`` (N,) is how many times the variance of all logs that of a log by itself is.
+    ``alone`` (N,) is the variance by a log itself over that by all.
     """
 
     times: FloatArray
@@ -317,10 +311,3 @@ class Spread:
         """(M, N): sds that are added, in those that all logs leave."""
         times = random.choice(self.times, count, p=self.weights)
         return np.asarray(times[:, None] * np.sqrt(1 + self.alone))
-
-
-def _before_the_cube(posterior: GaussianMixture, stretch: FloatArray) -> GaussianMixture:
-    """Stretched where the cube does not cut it off yet, each component as probable as before."""
-    covariances = posterior.covariances.numpy() * np.outer(stretch, stretch)
-    log_weights = posterior.log_weights + posterior.log_masses
-    return GaussianMixture(log_weights, posterior.means, covariances, posterior.space).of_masses()

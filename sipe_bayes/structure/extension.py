@@ -1,8 +1,7 @@
 """What a model may get: an extension is a piece of physics with parameters of its own, placed at a joint or elsewhere.
 
-It reduces to the plain model where its parameters have the model's own values, their defaults. To add one
-to this package, write a row of ``structure.extensions.table``. One of your own, outside this package, is a subclass of
-``Extension`` that is named by its import path. The simplest::
+It is the plain model where its parameters have their defaults. Those of this package are rows of
+``structure.extensions.table``; one of your own is a subclass of ``Extension`` that is named by its import path::
 
     from sipe_bayes.core.parameters import Parameter
     from sipe_bayes.structure.extension import Extension
@@ -65,7 +64,7 @@ class Extension(ABC):
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """Its unknowns, their bounds in SI from the sizes of the machine's motion; none where it does not apply."""
 
-    def wholes(self, machine: Machine, site: str) -> tuple[float, ...]:
+    def wholes(self, machine: Machine, site: str, /) -> tuple[float, ...]:
         """Of each parameter, in its unit, what a tolerance is a share of; none of numbers that logs alone tell."""
         return ()
 
@@ -73,7 +72,7 @@ class Extension(ABC):
         """What it is where a number with a tolerance is off by this share, in a report."""
         return f"{self.sentence(site)} ({100 * share:.3g} %)"
 
-    def memory(self, dt: float) -> float:
+    def memory(self, dt: float, /) -> float:
         """Seconds that a sample at most tells of the past, of logs with ``dt``: see ``Environment.remembers``."""
         return 0.0
 
@@ -81,7 +80,7 @@ class Extension(ABC):
         """Names of sites at which it may be one and the same thing, beside those that the user takes to be alike."""
         return ()
 
-    def edit(self, machine: Machine, site: str) -> Edit | None:
+    def edit(self, machine: Machine, site: str, /) -> Edit | None:
         """What is changed in the MJCF, where parameters of it are not enough."""
         return None
 
@@ -123,8 +122,8 @@ def plain_theta(parameters: Sequence[Parameter]) -> FloatArray:
 class Placed:
     """An extension at a site: the name of a joint, tendon, actuator, body or channel, or of several; or ``WORLD``.
 
-    ``parameters`` have the model's own values as defaults. ``edit`` is what it changes in the MJCF, ``probes`` theta
-    (G, K, P) at which it is tried, for each of G shapes; ``wholes`` see ``Extension.wholes``.
+    ``parameters`` have the model's own values as defaults; ``edit``, ``probes`` (G, K, P) and ``wholes`` see
+    ``Extension``.
     """
 
     extension: Extension
@@ -148,6 +147,20 @@ class Placed:
     def plain(self) -> FloatArray:
         """Theta (P,) where it changes nothing."""
         return plain_theta(self.parameters)
+
+    @property
+    def by_log(self) -> bool:
+        """Whether it is of one log alone."""
+        return any(parameter.log is not None for parameter in self.parameters)
+
+    @property
+    def remedy(self) -> str:
+        """How it comes into the model."""
+        if self.edit is not None:  # the model has no such part yet
+            return f"let `sipe discover` put it in (--only {self.extension.name})"
+        targets = [target for parameter in self.parameters for target in parameter.targets]
+        what = "as a parameter (or widen its bounds)" if len(targets) == 1 else "as parameters (or widen their bounds)"
+        return f"add {' and '.join(targets)} {what}"
 
 
 def extended(environment: MjcfEnvironment, placed: Sequence[Placed]) -> MjcfEnvironment:
@@ -198,9 +211,7 @@ def _together(extension: Extension, sites: tuple[str, ...], machine: Machine) ->
         tuple(site for site in sites if set(parameter.targets) & set(extension.imitators(site)))
         for parameter in machine.environment.parameters
     )
-    for alike in dict.fromkeys((*extension.groups(machine), *written)):
-        if len(alike) > 1:
-            yield _AND.join(alike)
+    yield from (_AND.join(alike) for alike in dict.fromkeys((*extension.groups(machine), *written)) if len(alike) > 1)
 
 
 def _with_own(machine: Machine, parameter: Parameter) -> Parameter:

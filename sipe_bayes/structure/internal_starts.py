@@ -1,7 +1,4 @@
-"""Where windows start in states that an extension brings: nothing measures them, so they are carried on.
-
-A window begins where the one before it has ended, simulated from rest: what came before that is mostly forgotten.
-"""
+"""Where windows start in states that an extension brings: where the window before has ended, simulated from rest."""
 
 from __future__ import annotations
 

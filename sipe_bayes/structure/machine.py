@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -26,10 +25,9 @@ class Sizes:
     Args:
         position: root-mean-square of a joint's, spread of a tendon's length or of what a channel measures.
         velocity: root-mean-square, of an actuator that of the joint that it drives.
-        force: the largest of what drives, carries and accelerates a joint; what that of its joints amounts to along a
-            tendon; root-mean-square of an actuator's, of several the largest.
-        inertia: that a joint moves.
-        command: the largest.
+        force: the largest of what drives, carries and accelerates a joint, or of that of its joints along a tendon;
+            root-mean-square of an actuator's, of several the largest.
+        inertia, command: that a joint moves; the largest.
         length, least: a tendon's mean, and the smallest that it may have: -inf of sums of joints' positions.
         dt, step: shortest time between samples, and that of the physics.
     """
@@ -51,11 +49,10 @@ class Sizes:
 
 @dataclass(frozen=True)
 class BodySizes:
-    """Of one body that moves, as the model has it, in kg and m: x, y and z of its centre of mass in the body's frame.
+    """Of a body that moves, in kg and m: its centre of mass (3,) in its own frame, and radii of gyration about that.
 
-    With the radii of ``gyration`` about that and about the nearest joint that turns it (``reach``; ``gyration`` where
-    none does), and the axes of the frame along which it matters where the centre lies: all but those that every joint
-    turns it about.
+    ``reach`` is the one about the nearest joint that turns it; along the axes ``turned`` (3,) of the frame it matters
+    where the centre lies: all but those that every joint turns it about.
     """
 
     mass: float
@@ -69,9 +66,8 @@ class BodySizes:
 class Machine:
     """An environment, the user's model, with the sizes of its motion along the logs, by name.
 
-    Of each hinge and slide joint, each tendon that joints move, the root-mean-square of each commanded actuator's
-    force, the largest size of each command, and the spread of each measured channel; ``dt`` is the shortest time
-    between samples, in seconds.
+    ``forces`` are root-mean-squares of commanded actuators, ``commands`` their largest, ``channels`` the spreads of
+    measurements; ``dt`` is the shortest time between samples, in seconds.
     """
 
     environment: MjcfEnvironment
@@ -102,24 +98,27 @@ class Machine:
         for index in range(1, model.nbody):
             mass, name, centre = float(model.body_mass[index]), str(model.body(index).name), model.body_ipos[index]
             if name and mass > 0 and model.body_weldid[index]:
-                gyration = float(np.sqrt(model.body_inertia[index].max() / mass))
-                reach = float(np.hypot(gyration, _lever(model, data, index)))
-                sizes[name] = BodySizes(mass, tuple(centre.tolist()), gyration, reach, _turned(model, data, index))
+                gyration, (lever, turned) = (
+                    float(np.sqrt(model.body_inertia[index].max() / mass)),
+                    _turning(data, index),
+                )
+                sizes[name] = BodySizes(
+                    mass, tuple(centre.tolist()), gyration, float(np.hypot(gyration, lever)), turned
+                )
         return sizes
 
     @cached_property
     def alike(self) -> tuple[tuple[str, ...], ...]:
         """Commanded actuators of one make: alike in all but where they pull and which way."""
         model, makes = self.model, dict[tuple[float, ...], list[str]]()
+        types, limits = ("trntype", "dyntype", "gaintype", "biastype"), ("ctrlrange", "forcerange")
+        kinds = (*types, "gainprm", "biasprm", "dynprm", *limits)
         for name in self.environment.actuators:
             k = model.actuator(name).id
             joint = driven_joint(model, k)
+            own = (np.ravel(getattr(model, f"actuator_{kind}")[k]) for kind in kinds)
             moved = int(model.jnt_type[joint]) if joint >= 0 else -1
-            kinds = (moved, model.actuator_trntype[k], model.actuator_dyntype[k], model.actuator_gaintype[k])
-            sizes = (np.linalg.norm(model.actuator_gear[k]), model.actuator_biastype[k])
-            own = (model.actuator_gainprm, model.actuator_biasprm, model.actuator_dynprm)
-            limits = (model.actuator_ctrlrange, model.actuator_forcerange)
-            numbers = np.concatenate([kinds, sizes, *(array[k] for array in (*own, *limits))])
+            numbers = np.concatenate([[moved, np.linalg.norm(model.actuator_gear[k])], *own])
             makes.setdefault(tuple(np.round(numbers, 9).tolist()), []).append(name)
         return tuple(tuple(names) for names in makes.values() if len(names) > 1)
 
@@ -154,7 +153,8 @@ def machine_of(windows: BoundLikelihood, theta: FloatArray, starts: FloatArray) 
         raise ValueError("simulator: structures are looked for in a user's MJCF; give a Simulator of one")
     model = windows.simulator.written(theta)
     states, controls = _motion(windows, theta, starts)
-    driving, pulls, inertias = _forces(model, states, controls)
+    along = _along(model, states, controls)
+    pulls, inertias = np.sqrt((along["force"] ** 2).mean(0)), along["inertia"].mean(0)
     commands = {a: float(np.abs(windows.actions[..., k]).max()) for k, a in enumerate(environment.actuators)}
     joints = {}
     for joint in range(model.njnt):
@@ -162,41 +162,29 @@ def machine_of(windows: BoundLikelihood, theta: FloatArray, starts: FloatArray) 
             dof, address = int(model.jnt_dofadr[joint]), int(model.jnt_qposadr[joint])
             sizes = _rms(states[:, 1 + address]), _rms(states[:, 1 + model.nq + dof]), pulls[dof], inertias[dof]
             joints[str(model.joint(joint).name)] = Sizes(*(max(float(s), 1e-9) for s in sizes))
-    forces = {a: max(_rms(driving[:, model.actuator(a).id]), 1e-9) for a in environment.actuators}
+    forces = {a: max(_rms(along["driving"][:, model.actuator(a).id]), 1e-9) for a in environment.actuators}
     spread = np.maximum(np.nanstd(windows.trajectories.observations, axis=(0, 1)), 1e-9)
     channels = dict(zip(environment.channels, spread.tolist(), strict=True))
-    names, tendons = tuple(str(name) for name in windows.trajectories.names), _tendons(model, states, pulls)
+    names, tendons = tuple(str(name) for name in windows.trajectories.names), _tendons(model, along, pulls)
     return Machine(environment, joints, tendons, forces, commands, channels, names, float(windows.dt.min()))
 
 
-def _joints_of(model: mujoco.MjModel, body: int) -> Iterator[tuple[int, int]]:
-    """The joints that move a body and their types, the nearest first."""
-    while body:
-        first = int(model.body_jntadr[body])
-        yield from ((k, int(model.jnt_type[k])) for k in reversed(range(first, first + int(model.body_jntnum[body]))))
-        body = int(model.body_parentid[body])
-
-
-def _turned(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> tuple[bool, ...]:
-    """Along which axes of a body's frame a place in it is moved by the joints that turn it."""
-    axes, turned = data.xmat[body].reshape(3, 3), np.zeros(3, bool)
-    for joint, kind in _joints_of(model, body):
-        if kind == mujoco.mjtJoint.mjJNT_HINGE:
-            turned |= np.abs(axes.T @ data.xaxis[joint]) < 1 - 1e-6
-        elif kind != mujoco.mjtJoint.mjJNT_SLIDE:
-            turned[:] = True
-    return tuple(turned.tolist())
-
-
-def _lever(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> float:
-    """How far a body's centre of mass lies from the nearest joint that turns it; 0 where none does."""
-    for joint, kind in _joints_of(model, body):
-        apart = data.xipos[body] - data.xanchor[joint]
-        if kind == mujoco.mjtJoint.mjJNT_HINGE:
-            return float(np.linalg.norm(np.cross(data.xaxis[joint], apart)))
-        if kind == mujoco.mjtJoint.mjJNT_BALL:
-            return float(np.linalg.norm(apart))
-    return 0.0
+def _turning(data: mujoco.MjData, body: int) -> tuple[float, tuple[bool, ...]]:
+    """How far a body's centre of mass lies from the nearest joint that turns it, 0 where none does; and ``turned``."""
+    model, axes, levers, turned = data.model, data.xmat[body].reshape(3, 3), list[float](), np.zeros(3, bool)
+    above = body
+    while above:
+        first = int(model.body_jntadr[above])
+        for joint in reversed(range(first, first + int(model.body_jntnum[above]))):
+            kind, apart = int(model.jnt_type[joint]), data.xipos[body] - data.xanchor[joint]
+            if kind == mujoco.mjtJoint.mjJNT_HINGE:
+                levers.append(float(np.linalg.norm(np.cross(data.xaxis[joint], apart))))
+                turned |= np.abs(axes.T @ data.xaxis[joint]) < 1 - 1e-6
+            elif kind != mujoco.mjtJoint.mjJNT_SLIDE:
+                levers += [float(np.linalg.norm(apart))] * (kind == mujoco.mjtJoint.mjJNT_BALL)
+                turned[:] = True
+        above = int(model.body_parentid[above])
+    return next(iter(levers), 0.0), tuple(turned.tolist())
 
 
 def _motion(windows: BoundLikelihood, theta: FloatArray, starts: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -212,35 +200,30 @@ def _motion(windows: BoundLikelihood, theta: FloatArray, starts: FloatArray) -> 
     return states[rows], controls[rows]
 
 
-def _forces(
-    model: mujoco.MjModel, states: FloatArray, controls: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Actuator forces (n, nu) along a motion; of the dofs the size of their forces (nv,) and their inertia (nv,)."""
-    data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
-    driving, parts, diagonals = [], [], []
+def _along(model: mujoco.MjModel, states: FloatArray, controls: FloatArray) -> dict[str, FloatArray]:
+    """By name, of states (n, S) with controls (n, U): actuators' forces (n, nu), dofs' inertias and forces (n, nv).
+
+    Those are the largest of what drives, carries and accelerates a dof. And tendons' lengths, velocities, and arms.
+    """
+    data, inertia, rows = mujoco.MjData(model), np.zeros((model.nv, model.nv)), []
     for state, control in zip(states, controls, strict=True):
         mujoco.mj_setState(model, data, np.ascontiguousarray(state), mujoco.mjtState.mjSTATE_FULLPHYSICS)
         data.ctrl[:] = control
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, inertia)
-        driving.append(data.actuator_force.copy())
-        diagonals.append(np.diag(inertia).copy())
-        parts.append(np.abs([data.qfrc_actuator, data.qfrc_bias, inertia @ data.qacc]).max(0))
-    return np.array(driving), np.sqrt((np.array(parts) ** 2).mean(0)), np.mean(diagonals, axis=0)
+        forces = np.abs([data.qfrc_actuator, data.qfrc_bias, inertia @ data.qacc]).max(0)
+        tendons = data.ten_length.copy(), data.ten_velocity.copy(), np.abs(tendon_arms(model, data))
+        rows.append((data.actuator_force.copy(), np.diag(inertia).copy(), forces, *tendons))
+    names = ("driving", "inertia", "force", "length", "velocity", "arms")
+    return {name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
 
 
-def _tendons(model: mujoco.MjModel, states: FloatArray, forces: FloatArray) -> dict[str, Sizes]:
-    """Of the tendons that move, from states (n, S) and sizes of the dofs' forces (nv,)."""
-    data, rows = mujoco.MjData(model), []
-    for state in states if model.ntendon else ():
-        mujoco.mj_setState(model, data, np.ascontiguousarray(state), mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        mujoco.mj_fwdPosition(model, data)
-        mujoco.mj_fwdVelocity(model, data)
-        arms = np.abs(tendon_arms(model, data))
-        rows.append((data.ten_length.copy(), data.ten_velocity.copy(), arms @ forces, (arms**2).sum(1)))
+def _tendons(model: mujoco.MjModel, along: dict[str, FloatArray], forces: FloatArray) -> dict[str, Sizes]:
+    """Of the tendons that move, beside sizes of the dofs' forces (nv,)."""
     sizes, gears = {}, {motor_side(model, model.joint(joint).name) for joint in range(model.njnt)}
     for tendon in set(range(model.ntendon)) - gears:  # the motor's side of a joint is that joint's
-        length, velocity, pull, square = (np.array([row[k][tendon] for row in rows]) for k in range(4))
+        length, velocity, arms = along["length"][:, tendon], along["velocity"][:, tendon], along["arms"][:, tendon]
+        pull, square = arms @ forces, (arms**2).sum(1)
         if model.tendon(tendon).name and length.std() > 0 and square.mean() > 0:
             by_joints = int(model.wrap_type[model.tendon_adr[tendon]]) == int(mujoco.mjtWrap.mjWRAP_JOINT)
             least, force = -np.inf if by_joints else 0.0, max(float(pull.mean() / square.mean()), 1e-9)

@@ -1,11 +1,8 @@
 """What extensions would do to the predictions of a fit: the rows of score tests.
 
-Every extension is simulated a small step away from the plain model, from the same starts: those that need no more than
-parameters in one batch, laws and those that change the model's states each by itself.
-
-Where a parameter of the model does about the same as an extension (its ``imitators``: a delay beside a lag), a small
-step shows nothing but what that parameter explains. A probe then goes as far as it can take from the parameter what it
-adds, and what that changes grows about with the square of how far it goes: a trade.
+Every extension is simulated a small step away from the plain model, from the same starts. Where a parameter of the
+model does about the same (its ``imitators``: a delay beside a lag), a probe instead goes as far as it can take from the
+parameter what it adds, and what that changes grows about with the square of how far it goes: a trade.
 """
 
 from __future__ import annotations
@@ -24,7 +21,7 @@ from sipe_bayes.core.telling import Tell, silent
 from sipe_bayes.envs.mjcf import MjcfEnvironment
 from sipe_bayes.likelihood import BoundLikelihood
 from sipe_bayes.simulation.simulator import Simulator
-from sipe_bayes.structure.extension import Extension, Placed, extended, imitating, members, placements
+from sipe_bayes.structure.extension import Placed, extended, imitating, members, placements
 from sipe_bayes.structure.internal_starts import carried_starts, mapped_starts
 from sipe_bayes.structure.machine import machine_of
 from sipe_bayes.structure.registry import EXTENSIONS, get_extension
@@ -35,29 +32,28 @@ _Change = tuple[int, FloatArray, FloatArray, FloatArray]  # an ``Effect`` with t
 
 @dataclass(frozen=True)
 class Probe:
-    """A cause that a model may lack: its name and remedy in words, and the site of the extension that it is of.
+    """A cause that a model may lack: one direction of an extension, at size 1 with an effect of root-mean-square one.
 
     Args:
-        by_log: whether it is of one log alone.
-        size: root-mean-square of its effect where it was simulated.
+        placed: the extension.
         whole: its size where the number that it changes is off by all that a tolerance is a share of; nan where logs
             alone tell that number.
-        trade: (N,) by which it changes theta itself at size 1, and with the root of any other; none where not at all.
+        trade: (N,) by which it changes theta itself at size 1, and with the root of any other.
     """
 
-    name: str
-    remedy: str
-    by_log: bool
-    site: str
-    extension: Extension
-    size: float
-    whole: float = math.nan
-    trade: tuple[float, ...] = ()
+    placed: Placed
+    whole: float
+    trade: FloatArray
+
+    @property
+    def name(self) -> str:
+        """In words."""
+        return self.placed.sentence
 
     @property
     def is_step(self) -> bool:
         """Whether it is what the simulation's physics step does, which no machine takes."""
-        return self.extension.name == "physics_step"
+        return self.placed.extension.name == "physics_step"
 
 
 @dataclass(frozen=True)
@@ -78,25 +74,16 @@ class Effect:
         return np.asarray(np.sqrt((self.change**2).mean((0, 1, 2))))
 
     def named(self) -> list[Probe]:
-        """Its K probes, of changes of a root-mean-square of one."""
+        """Its K probes."""
         placed, size = self.placed, self.size
-        targets = [target for parameter in placed.parameters for target in parameter.targets]
-        what = "as a parameter (or widen its bounds)" if len(targets) == 1 else "as parameters (or widen their bounds)"
-        by_log = any(parameter.log is not None for parameter in placed.parameters)
-        remedy = f"add {' and '.join(targets)} {what}"
-        if placed.edit is not None:  # the model has no such part yet
-            remedy = f"let `sipe discover` put it in (--only {placed.extension.name})"
-        wholes, trades = np.full(len(size), math.nan), np.zeros((len(size), 0))
-        if self.trades.any():
-            trades = self.trades / np.sqrt(size)[:, None]
-        elif not placed.parameters:
+        wholes = np.full(len(size), math.nan)
+        if not placed.parameters:
             wholes = size
-        elif placed.wholes:
+        elif placed.wholes and not self.trades.any():
             ranges = np.array([parameter.high - parameter.low for parameter in placed.parameters])
             wholes = size / ((self.probes - placed.plain) * ranges / np.array(placed.wholes)).sum(-1)
-        probe = partial(Probe, placed.sentence, remedy, by_log, placed.site, placed.extension)
-        rows = zip(size.tolist(), wholes.tolist(), map(tuple, trades.tolist()), strict=True)
-        return [probe(*row) for row in rows]
+        rows = zip(wholes.tolist(), self.trades / np.sqrt(size)[:, None], strict=True)
+        return [Probe(placed, whole, trade) for whole, trade in rows]
 
 
 def bounds(plain: FloatArray, tried: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -105,9 +92,9 @@ def bounds(plain: FloatArray, tried: FloatArray) -> tuple[FloatArray, FloatArray
         return np.zeros(len(tried)), np.ones(len(tried))
     direction = tried - plain
     with np.errstate(divide="ignore", invalid="ignore"):
-        up = np.where(direction > 0, (1 - plain) / direction, np.where(direction < 0, -plain / direction, np.inf))
-        down = np.where(direction > 0, -plain / direction, np.where(direction < 0, (1 - plain) / direction, -np.inf))
-    return np.minimum(down.max(1), 0.0), np.maximum(up.min(1), 0.0)
+        ends = np.stack([-plain / direction, (1 - plain) / direction])  # of the cube, along each axis
+    down = np.where(direction == 0, -np.inf, ends.min(0)).max(1)
+    return np.minimum(down, 0.0), np.maximum(np.where(direction == 0, np.inf, ends.max(0)).min(1), 0.0)
 
 
 def place_extensions(windows: BoundLikelihood, theta: FloatArray, starts: FloatArray) -> list[Placed]:
@@ -136,7 +123,7 @@ def effects(
 ) -> list[Effect]:
     """The effects of extensions that change what is observed of W windows, at theta (N,) and starts (W, D).
 
-    ``tell`` is called with what is being done; ``kept`` keeps what they do, group by group.
+    ``tell`` is called with what is being done; ``kept`` keeps it by group.
     """
 
     def changes(group: list[Placed], kept: Kept) -> tuple[_Change, ...]:
@@ -159,9 +146,8 @@ def _groups(placed: Sequence[Placed]) -> list[list[Placed]]:
         # a law costs steps of its own, an edit makes another model: a law goes with its like, an edit by itself
         single = one.edit is None and len(members(one.site)) == 1
         key = ("" if one.extension.native else one.extension.name) if single else one.label
-        if any(parameter.log is not None for parameter in one.parameters):
-            key = key or "by log"  # which writes what others write for all logs
-        groups.setdefault(key, []).append(one)
+        # of one log: which writes what others write for all
+        groups.setdefault(key or "by log" * one.by_log, []).append(one)
     return list(groups.values())
 
 
@@ -174,10 +160,7 @@ def _of_group(windows: BoundLikelihood, theta: FloatArray, starts: FloatArray, g
 
 
 def _extended(windows: BoundLikelihood, group: list[Placed]) -> BoundLikelihood | None:
-    """The logs bound to the model with them all, beside the extensions that it has; None where it can not have them.
-
-    Nor those with states of their own, where the logs' recorded states are to be held to.
-    """
+    """The logs bound to the model with them all; None where it can not have them, or states that logs do not record."""
     environment = windows.simulator.environment
     assert isinstance(environment, MjcfEnvironment)
     try:
@@ -196,19 +179,19 @@ def _simulated(
     bound.budget, bound.deadline = windows.budget - windows.rollouts, windows.deadline
     before, after = windows.simulator.model, bound.simulator.model
     if (before.nq, before.nv, before.na) == (after.nq, after.nv, after.na):  # whatever history of commands it has
-        own = 1 + before.nq + before.nv + before.na
-        bound.reference[:, :own] = windows.reference[:, :own]
+        own = slice(1 + before.nq + before.nv + before.na)
+        bound.reference[:, own] = windows.reference[:, own]
     plain = np.concatenate([theta, *(one.plain for one in group)])
     fixed = any(one.extension.fixed for one in group)  # there are no values at which it is the plain model
     rows, first = [] if fixed else [plain], len(theta)
     tried = [_traded(windows.simulator.space, theta, one) for one in group]
     for probes, trade in tried:
-        for probe in (probe for shape in probes for probe in shape):
-            row = plain.copy()
-            row[: len(theta)] += trade
-            row[first : first + len(probe)] = probe
-            rows.append(row)
-        first += probes.shape[-1]
+        last = first + probes.shape[-1]
+        rows += [
+            np.concatenate([theta + trade, plain[len(theta) : first], probe, plain[last:]])
+            for probe in np.concatenate(probes)
+        ]
+        first = last
     mapped, runs = mapped_starts(before, after, starts), []
     try:
         for piece in np.array_split(np.stack(rows), math.ceil(len(rows) / _ROWS)):

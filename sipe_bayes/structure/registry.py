@@ -1,10 +1,4 @@
-"""The only list of extensions, and how one of the user's own is found.
-
-What is no extension: a column that switches the torque off for a part of a log. It is known and not unknown, and no
-number of a model stands for it: a motor without torque is a motor with command zero, a servo without torque has no
-gains. Cut such parts out; by themselves, under a model without the actuators, they tell friction and inertia apart from
-the drive, as a prior for the rest.
-"""
+"""The only list of extensions, and how one of the user's own is found."""
 
 from __future__ import annotations
 

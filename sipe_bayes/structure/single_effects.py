@@ -1,10 +1,10 @@
 r"""Which few of many columns are at work, and how surely: a sum of single effects, and all of them, each a little.
 
-The coefficients of K correlated columns are a sum of effects, each of one column at most (SuSiE: G. Wang, A. Sarkar,
-P. Carbonetto, M. Stephens, "A simple new approach to variable selection in regression", J. R. Stat. Soc. B 82 (2020),
-1273-1300, https://doi.org/10.1111/rssb.12388), each with the probability that it is which. Beside them all may be at
-work, each a little (SuSiE-inf: R. Cui et al., "Improving fine-mapping by modeling infinitesimal effects", Nature
-Genetics 56 (2024), 162-169, https://doi.org/10.1038/s41588-023-01597-3).
+The coefficients of K correlated columns are a sum of effects of one column each (SuSiE: G. Wang, A. Sarkar, P.
+Carbonetto, M. Stephens, "A simple new approach to variable selection in regression", J. R. Stat. Soc. B 82 (2020),
+1273-1300, https://doi.org/10.1111/rssb.12388). Beside them all may be at work, each a little (SuSiE-inf: R. Cui et al.,
+"Improving fine-mapping by modeling infinitesimal effects", Nature Genetics 56 (2024), 162-169,
+https://doi.org/10.1038/s41588-023-01597-3).
 
 With S the information of the columns and q their score, an effect of column k has b_k ~ N(0, t^2 / S_kk), halved where
 its size may not be negative; all columns have N(0, t^2 / (c_k S_kk)), c_k the number of extensions times that of the
@@ -21,8 +21,7 @@ distributions for variance parameters in hierarchical models", 2006, https://doi
 Deviations:
 
 - The size of an effect is integrated over a grid, not estimated, and each effect may be none.
-- Effects are added one at a time, while the last one is more likely there than not; that last one is kept.
-- All columns at work are asked of what the single effects leave, after them; their sizes have either sign.
+- Effects are added one at a time, while the last one is more likely there than not; then follow all columns at work.
 """
 
 from __future__ import annotations
@@ -30,11 +29,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.special
 
-from sipe_bayes.core.arrays import BoolArray, FloatArray
+from sipe_bayes.core.arrays import BoolArray, FloatArray, IntArray
 from sipe_bayes.posterior.truncated_normal import interval_quantile
 
 ABSENT = 0.75  # prior probability that an effect is none; that not all columns are at work
@@ -50,29 +50,42 @@ def size_grid() -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class Columns:
-    """K columns, all else projected out, with the names of the extensions that they belong to.
-
-    Information (K, K), score (K,), and which (K,) may not have a negative size.
-    """
+    """K columns of extensions, all else projected out: information (K, K), score (K,), which (K,) are not negative."""
 
     names: Sequence[str]
     information: FloatArray
     score: FloatArray
     one_sided: BoolArray
 
-    @property
+    @cached_property
     def parts(self) -> FloatArray:
         """Each column's share (K,) of its extension's, where all extensions have the same; they add up to one."""
         count = Counter(self.names)
         return np.array([1 / (len(count) * count[name]) for name in self.names])
 
+    @cached_property
+    def root(self) -> FloatArray:
+        """(K,) by which sizes become z."""
+        return np.sqrt(np.diag(self.information))
+
+
+def _probabilities(evidence: FloatArray) -> FloatArray:
+    """Of log evidences (...) beside that of none."""
+    evidence = evidence + np.log1p(-ABSENT)
+    return np.exp(evidence - np.logaddexp(np.log(ABSENT), scipy.special.logsumexp(evidence)))
+
+
+def _chosen(probabilities: FloatArray, count: int, random: np.random.Generator) -> IntArray:
+    """So many draws of numbers of probabilities (J,), and J for none."""
+    every = np.append(probabilities, max(1 - probabilities.sum(), 0.0))
+    return random.choice(len(every), count, p=every / every.sum())
+
 
 @dataclass(frozen=True)
 class SingleEffect:
-    """One of some columns at work, of any size, or none.
+    """One of some columns at work, of any size, or none: ``weights`` (T, K) are the probabilities of size and column.
 
-    ``weights`` (T, K) are the probabilities of size and column, ``mean`` (T, K) and ``sd`` (T, 1) those of the normal
-    of the column's z, before it is cut off.
+    ``mean`` (T, K) and ``sd`` (T, 1) are those of the normal of the column's z, before it is cut off.
     """
 
     weights: FloatArray
@@ -84,13 +97,11 @@ class SingleEffect:
     def of(cls, columns: Columns, score: FloatArray) -> SingleEffect:
         """By what other effects leave of the score (K,)."""
         t, believed = size_grid()
-        z, shrunk = score / np.sqrt(np.diag(columns.information)), (t**2 / (1 + t**2))[:, None]
+        z, shrunk = score / columns.root, (t**2 / (1 + t**2))[:, None]
         evidence = -0.5 * np.log1p(t**2)[:, None] + 0.5 * shrunk * z**2
         half = np.log(2) + scipy.special.log_ndtr(np.sqrt(shrunk) * z)
         evidence = evidence + np.where(columns.one_sided, half, 0.0) + np.log(believed)[:, None]
-        evidence = evidence + np.log(columns.parts) + np.log1p(-ABSENT)
-        total = np.logaddexp(np.log(ABSENT), scipy.special.logsumexp(evidence))
-        return cls(np.exp(evidence - total), shrunk * z, np.sqrt(shrunk), columns)
+        return cls(_probabilities(evidence + np.log(columns.parts)), shrunk * z, np.sqrt(shrunk), columns)
 
     @property
     def present(self) -> float:
@@ -99,9 +110,9 @@ class SingleEffect:
 
     def alike(self) -> list[str]:
         """What it may be: of the columns' names the likeliest, and two at most of a fifth of its probability."""
-        chance: dict[str, float] = {}
+        chance = Counter[str]()
         for name, own in zip(self.columns.names, self.by_column.tolist(), strict=True):
-            chance[name] = chance.get(name, 0.0) + own
+            chance[name] += own
         ranked = sorted(chance, key=lambda name: -chance[name])
         return [name for name in ranked if chance[name] >= 0.2 * chance[ranked[0]]][:3]
 
@@ -122,20 +133,18 @@ class SingleEffect:
         cut = -self.mean / self.sd
         tail = np.exp(-0.5 * cut**2 - 0.5 * np.log(2 * np.pi) - scipy.special.log_ndtr(-cut))
         mean = np.where(self.columns.one_sided, self.mean + self.sd * tail, self.mean)
-        return np.asarray((self.weights * mean).sum(0) / np.sqrt(np.diag(self.columns.information)))
+        return np.asarray((self.weights * mean).sum(0) / self.columns.root)
 
     def draws(self, count: int, random: np.random.Generator) -> FloatArray:
         """Of the sizes (count, K)."""
-        grid, k = self.weights.shape
-        flat = np.append(self.weights.ravel(), max(1 - self.present, 0.0))
-        chosen = random.choice(len(flat), count, p=flat / flat.sum())
-        there = np.flatnonzero(chosen < grid * k)
-        t, column = np.divmod(chosen[there], k)
+        chosen = _chosen(self.weights.ravel(), count, random)
+        there = np.flatnonzero(chosen < self.weights.size)
+        t, column = np.divmod(chosen[there], len(self.columns.root))
         mean, sd = self.mean[t, column], self.sd[t, 0]
         low = np.where(self.columns.one_sided[column], -mean / sd, -_FAR)
         own = mean + sd * interval_quantile(low, np.maximum(low, 0.0) + _FAR, random.uniform(size=len(there)))
-        sizes = np.zeros((count, k))
-        sizes[there, column] = own / np.sqrt(np.diag(self.columns.information)[column])
+        sizes = np.zeros((count, len(self.columns.root)))
+        sizes[there, column] = own / self.columns.root[column]
         return sizes
 
 
@@ -150,14 +159,11 @@ class AllEffects:
         square = self.t[:, None] ** 2
         grown = square / (1 + square * self.values)
         evidence = 0.5 * (grown * self.along**2 - np.log1p(square * self.values)).sum(1) + np.log(believed)
-        evidence = evidence + np.log1p(-ABSENT)
-        total = np.logaddexp(np.log(ABSENT), scipy.special.logsumexp(evidence))
-        self.weights = np.exp(evidence - total)
+        self.weights = _probabilities(evidence)
 
     def draws(self, count: int, random: np.random.Generator) -> FloatArray:
         """Of the sizes (count, K)."""
-        weights = np.append(self.weights, max(1 - self.weights.sum(), 0.0))
-        square = random.choice(np.append(self.t, 0.0), count, p=weights / weights.sum())[:, None] ** 2
+        square = np.append(self.t, 0.0)[_chosen(self.weights, count, random)][:, None] ** 2
         variance = square / (1 + square * self.values)
         along = variance * self.along + np.sqrt(variance) * random.standard_normal((count, len(self.values)))
         return np.asarray(along @ self.axes.T * self.scale)
@@ -182,12 +188,9 @@ class Effects:
 
 
 def find_effects(columns: Columns) -> Effects:
-    """The effects' posterior, by coordinate ascent: each is fitted to what the others leave (Wang et al., section 3.2).
-
-    Five single ones at most: a dozen small ones together explain anything.
-    """
+    """Their posterior by coordinate ascent: each is fitted to what the others leave (Wang et al., section 3.2)."""
     effects = list[SingleEffect]()
-    for _ in range(5):
+    for _ in range(5):  # a dozen small ones together explain anything
         more = _settled(columns, effects)
         if sum(effect.present <= 0.5 for effect in more) > 1:  # the new one shares what another had
             break
@@ -199,8 +202,8 @@ def find_effects(columns: Columns) -> Effects:
 
 
 def _settled(columns: Columns, effects: Sequence[SingleEffect]) -> list[SingleEffect]:
-    """These and a new one, each fitted to what the others leave, until none changes by a thousandth of an sd."""
-    made, sd = list(effects), np.sqrt(np.diag(columns.information))
+    """These and a new one, each fitted to what the others leave, until all stay within a thousandth of an sd."""
+    made = list(effects)
     sizes = np.array([*(effect.sizes for effect in effects), np.zeros(len(columns.score))])
     for _ in range(30):
         before = sizes.copy()
@@ -208,6 +211,6 @@ def _settled(columns: Columns, effects: Sequence[SingleEffect]) -> list[SingleEf
             rest = sizes.sum(0) - sizes[k]
             made[k : k + 1] = [SingleEffect.of(columns, columns.score - columns.information @ rest)]
             sizes[k] = made[k].sizes
-        if (np.abs(sizes - before) * sd).max() < 1e-3:
+        if (np.abs(sizes - before) * columns.root).max() < 1e-3:
             break
     return made

@@ -1,7 +1,6 @@
 """Numbers that no machine has exactly, and that often no motion tells: forces, drawings, clocks.
 
-A machine whose motors give a tenth more than the log says, with masses, inertias and friction a tenth larger, moves
-alike. Theta's answer to a number that is off by its tolerance is what values are unknown by beside all that logs tell.
+A machine whose motors give a tenth more, with masses, inertias and friction a tenth larger, moves alike.
 """
 
 from __future__ import annotations
@@ -16,11 +15,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Sds of numbers that no machine has exactly; by default all are exact.
+    """Sds of numbers that no machine has exactly, as shares; by default all are exact.
 
-    ``commands``: of what each actuator delivers, as a share of what its command says. ``geometry``: of where a body's
-    centre of mass lies, as a share of its ``reach``, and of a mass that is not unknown. ``timing``: of when a
-    measurement was taken, as a share of the time between samples. ``physics_step``: as a share of all that steps do.
+    ``commands``: of what each actuator's command says. ``geometry``: of the ``reach`` of a body's centre of mass, and
+    of a mass that is fixed. ``timing``: of the time between samples. ``physics_step``: of all that steps do.
     """
 
     commands: Mapping[str, float] = field(default_factory=dict)
@@ -31,9 +29,10 @@ class Tolerances:
     def of(self, probe: Probe) -> float:
         """The sd of the number that a probe changes."""
         if probe.is_step:  # n times as short it changes (n - 1)/n of all that steps do
-            return self.physics_step * probe.extension.slow / (probe.extension.slow - 1)
-        shares = {"body": self.geometry, "channel": self.timing, "actuator": self.commands.get(probe.site, 0.0)}
-        return shares.get(probe.extension.kind, 0.0)
+            return self.physics_step * probe.placed.extension.slow / (probe.placed.extension.slow - 1)
+        commands = self.commands.get(probe.placed.site, 0.0)
+        shares = {"body": self.geometry, "channel": self.timing, "actuator": commands}
+        return shares.get(probe.placed.extension.kind, 0.0)
 
 
 EXACT = Tolerances()

@@ -1,7 +1,6 @@
 """Extensions that are rows of a table: where one may be, what it is called, where it is described, and its parameters.
 
-Bounds come from the sizes of the machine's motion at the site. Where they hang on more than these, a row has a function
-of the machine in place of its parameters (``extensions.sites``, ``extensions.elastic``).
+Bounds come from the sizes of the machine's motion at the site, or of functions of the machine in ``extensions.sites``.
 """
 
 from __future__ import annotations
@@ -22,8 +21,6 @@ from sipe_bayes.structure.machine import Machine, Sizes
 Probes = tuple[tuple[tuple[float, ...], ...], ...]
 """Theta of the parameters at which a row is tried: of each shape its directions."""
 _OWNERS = {"channel": "sensor"}  # of targets, where not the kind itself
-
-
 Bound = float | Callable[[Sizes], float]
 
 
@@ -46,13 +43,10 @@ class Unknown:
     def at(self, kind: str, site: str, sizes: Sizes) -> Parameter:
         """At a site."""
         low, high = (bound if isinstance(bound, float) else bound(sizes) for bound in (self.low, self.high))
-        name, target = self.name if kind == WORLD else f"{site}.{self.name}", self.target or self.name
-        if isinstance(target, tuple):
-            targets = target
-        elif kind == WORLD:
-            targets = (target,)
-        else:
-            targets = tuple(f"{_OWNERS.get(kind, kind)}:{member}.{target}" for member in members(site))
+        name, targets = self.name if kind == WORLD else f"{site}.{self.name}", self.target or self.name
+        if isinstance(targets, str):
+            owners = [""] if kind == WORLD else [f"{_OWNERS.get(kind, kind)}:{member}." for member in members(site)]
+            targets = tuple(owner + targets for owner in owners)
         made = Parameter(name, low, high, scale=self.scale, targets=targets, description=self.description)
         return replace(made, prior_mean=self.prior[0], prior_sd=self.prior[1])
 
@@ -60,10 +54,8 @@ class Unknown:
 def sizes_of(machine: Machine, kind: Kind, site: str) -> Sizes:
     """What bounds are made of at a site of a machine."""
     own = Sizes(machine.channels.get(site, math.nan))
-    if kind == "joint":
-        own = machine.joints[site]
-    elif kind == "tendon":
-        own = machine.tendons[site]
+    if kind in ("joint", "tendon"):
+        own = (machine.joints if kind == "joint" else machine.tendons)[site]
     elif kind == "actuator":
         names = members(site)
         driven = machine.joint_of(site) if len(names) == 1 else None
@@ -75,7 +67,7 @@ def sizes_of(machine: Machine, kind: Kind, site: str) -> Sizes:
 
 @dataclass(frozen=True, eq=False)
 class Row(Extension):
-    """An extension with its parameters; fields that ``Extension`` has are described there.
+    """An extension with its parameters; fields and methods that ``Extension`` has are described there.
 
     Args:
         words: what it is, in the field's terms, with the site's name in braces.
@@ -85,8 +77,7 @@ class Row(Extension):
         imitator: the attribute of the same site that does about the same.
         needs: whether a site has a place for it; by default every one.
         per_log: whether each log has a value of its own.
-        error, whole, longest, edited: what ``off``, of ``share`` per cent at ``site``, ``wholes``, ``memory`` and
-            ``edit`` of ``Extension`` give.
+        error: what ``off`` gives, of ``share`` per cent at ``site``.
     """
 
     name: str
@@ -105,9 +96,9 @@ class Row(Extension):
     slow: int = 1
     per_log: bool = False
     error: str = ""
-    whole: Callable[[Machine, str], tuple[float, ...]] = lambda machine, site: ()
-    longest: Callable[[float], float] = lambda dt: 0.0
-    edited: Callable[[Machine, str], Edit | None] = lambda machine, site: None
+    wholes: Callable[[Machine, str], tuple[float, ...]] = lambda machine, site: ()
+    memory: Callable[[float], float] = lambda dt: 0.0
+    edit: Callable[[Machine, str], Edit | None] = lambda machine, site: None
 
     def sentence(self, site: str) -> str:
         """What it is."""
@@ -117,18 +108,6 @@ class Row(Extension):
         """See ``error``."""
         return self.error.format(site=site, share=100 * share) if self.error else super().off(site, share)
 
-    def wholes(self, machine: Machine, site: str) -> tuple[float, ...]:
-        """See ``whole``."""
-        return self.whole(machine, site)
-
-    def memory(self, dt: float) -> float:
-        """See ``longest``."""
-        return self.longest(dt)
-
-    def edit(self, machine: Machine, site: str) -> Edit | None:
-        """See ``edited``."""
-        return self.edited(machine, site)
-
     def parameters(self, machine: Machine, site: str) -> tuple[Parameter, ...]:
         """By the sizes of the motion there."""
         if not self.needs(machine, site):
@@ -136,9 +115,8 @@ class Row(Extension):
         unknowns = self.unknowns(machine, site) if callable(self.unknowns) else self.unknowns
         sizes = sizes_of(machine, self.kind, site)
         made = tuple(unknown.at(self.kind, site, sizes) for unknown in unknowns)
-        if not self.per_log:
-            return made
-        return tuple(replace(one, name=f"{one.name}[{log}]", log=log) for one in made for log in machine.logs)
+        logs = machine.logs if self.per_log else ()
+        return tuple(replace(p, name=f"{p.name}[{log}]", log=log) for p in made for log in logs) if logs else made
 
     def groups(self, machine: Machine) -> tuple[tuple[str, ...], ...]:
         """Actuators of one make."""

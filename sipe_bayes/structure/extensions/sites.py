@@ -5,6 +5,10 @@ velocity, lead an accelerated joint by about h/2. A step of h/n has an error of 
 that steps do (L. F. Richardson 1911, https://doi.org/10.1098/rsta.1911.0009). MuJoCo's dry friction is a soft
 constraint: a joint at rest under a force creeps, by the time constant of ``solreffriction`` and the impedance of
 ``solimpfriction``.
+
+Between a motor without inertia and its joint nothing can give way that shows: where the model has no armature there,
+the extension ``armature`` is found first, and compliances beside it. A base moves along x and y of the world, as soft
+and as heavy either way.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ import numpy as np
 from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.channels import is_rotation
+from sipe_bayes.envs.internal.elastic import Base, Elastic, Gear, Link
 from sipe_bayes.envs.internal.states import UNSETTLED, declare_start
 from sipe_bayes.envs.laws.bound import LawNumbers
 from sipe_bayes.envs.laws.registry import LAWS
@@ -29,6 +34,9 @@ from sipe_bayes.structure.extensions.row import Unknown
 from sipe_bayes.structure.machine import Machine
 
 _MOST_POLES = 60.0  # of a motor: periods of its cogging in a turn
+_SOFTEST = 2.0  # times the motion's own frequency: the lowest resonance, of a base under the machine alone
+_LEAST_RANGE = 20.0  # of the softest spring to the stiffest that the physics step resolves
+_LOSSES = 0.005, 0.3  # time constants of elastic joints, of the motion's own
 
 
 @dataclass(frozen=True)
@@ -85,11 +93,7 @@ def numbers_of_poles(machine: Machine, parameter: Parameter) -> FloatArray:
 
 
 def gain(machine: Machine, site: str) -> tuple[Unknown, ...]:
-    """A half to three halves of the model's: data sheets know a motor's constant about to a tenth.
-
-    None where gear or gain are unknown, nor of drives whose force is no one number's multiple: velocity servos,
-    motors with a bias, muscles and dcmotors.
-    """
+    """A half to three halves of the model's, where gear and gain are known and the force is one number's multiple."""
     index = machine.model.actuator(site).id
     own, bias = float(machine.model.actuator_gainprm[index, 0]), machine.model.actuator_biasprm[index]
     scaled = {f"actuator:{site}.{number}" for number in ("gear", "gain", "kp")}
@@ -111,10 +115,7 @@ def _gain(own: float, servo: bool, description: str) -> Unknown:
 
 
 def mass(machine: Machine, site: str) -> tuple[Unknown, ...]:
-    """From a quarter to four times the model's: a gripper may double with what it holds.
-
-    None of a body whose mass is unknown already, or heavier in a log by what the user says.
-    """
+    """From a quarter to four times the model's, of a body whose mass is known and the same in all logs."""
     head, own = f"body:{site}.", machine.bodies[site].mass
     known = any(target.startswith((f"{head}mass", f"{head}inertia")) for target in machine.written())
     if known or any(added.target == f"{head}mass" for added in machine.environment.added):
@@ -250,3 +251,96 @@ def _hardened(spec: mujoco.MjSpec, timeconst: float, impedance: float) -> None:
     for owner in (*spec.joints, *spec.tendons):
         owner.solref_friction[0] = min(timeconst, owner.solref_friction[0])
         owner.solimp_friction[:2] = np.maximum(owner.solimp_friction[:2], impedance)
+
+
+def compliance(side: str, machine: Machine, site: str) -> tuple[Unknown, ...]:
+    """From rigid to a spring whose resonance lies at twice the frequency of the motion; and its loss."""
+    if (elastic := _elastic(machine, site)) is None:
+        return ()
+    softest, losses = elastic[1:]
+    return (
+        Unknown(f"{side}_compliance", 0.0, 1 / softest, "twist per force", f"{side}.compliance"),
+        Unknown(f"{side}_compliance_loss", *losses, "damping over stiffness", f"{side}.compliance_loss", "log"),
+    )
+
+
+def backlash(side: str, machine: Machine, site: str) -> tuple[Unknown, ...]:
+    """Up to half the usual position."""
+    most = 0.5 * machine.joints[site].position
+    gap = Unknown(f"{side}_backlash", 0.0, most, "width of the gap", f"{side}.play")
+    return () if _elastic(machine, site) is None else (gap,)
+
+
+def spring(kind: type[Gear] | type[Link], machine: Machine, site: str) -> Gear | Link | None:
+    """The edit of a gear or a link."""
+    elastic = _elastic(machine, site)
+    return None if elastic is None else kind(site, elastic[0])
+
+
+def _elastic(machine: Machine, site: str) -> tuple[Elastic, float, tuple[float, float]] | None:
+    """What the elastic joint begins with, its softest spring in N m/rad or N/m, and the ends of its loss in s.
+
+    None where no motor drives the joint or the physics step is too long for any spring.
+    """
+    if all(machine.joint_of(actuator) != site for actuator in machine.environment.actuators):
+        return None
+    sizes, model = machine.joints[site], machine.model
+    own = float(model.dof_armature[int(model.joint(site).dofadr[0])])
+    rotor = own or 0.2 * sizes.inertia  # the motor's share of what the joint moves, where the model has none
+    link = max(sizes.inertia - own, 0.1 * sizes.inertia)
+    reduced, frequency = rotor * link / (rotor + link), sizes.velocity / sizes.position
+    stiffest, softest = reduced / machine.timestep**2, reduced * (_SOFTEST * frequency) ** 2
+    if stiffest < _LEAST_RANGE * softest:
+        return None
+    twist = 0.05 * sizes.force / softest  # of the softest spring's usual one, where windows may start
+    start = (min(twist, sizes.position), min(twist * _SOFTEST * frequency, sizes.velocity))
+    low, high = (share / frequency for share in _LOSSES)
+    return Elastic(stiffest, reduced, start, loss=(low * high) ** 0.5), softest, (low, high)
+
+
+def base(machine: Machine, site: str) -> tuple[Unknown, ...]:
+    """From rigid to a base whose resonance lies at twice the frequency of the motion; its mass and its loss."""
+    if (swaying := _swaying(machine)) is None:
+        return ()
+    _, mass, frequency, softest = swaying
+    low, high = (share / frequency for share in _LOSSES)
+    names = ("compliance", "compliance_inertia", "compliance_loss")
+    spring, inertia, loss = (tuple(f"joint:base_{axis}.{name}" for axis in "xy") for name in names)
+    return (
+        Unknown("base_compliance", 0.0, 1 / softest, "displacement per force", spring),
+        Unknown("base_mass", mass, 30 * mass, "of what moves with the base", inertia, "log"),
+        Unknown("base_loss", low, high, "damping over stiffness", loss, "log"),
+    )
+
+
+def base_joints(machine: Machine, site: str) -> Base | None:
+    """The edit of a base."""
+    if (swaying := _swaying(machine)) is None:
+        return None
+    root, mass, frequency, softest = swaying
+    swing = 0.0  # how far the machine's mass moves, at most
+    for joint, sizes in machine.joints.items():
+        lever = float(np.sqrt(sizes.inertia / mass)) if machine.is_hinge(joint) else 1.0
+        swing = max(swing, lever * sizes.position)
+    start = 0.3 * swing * frequency**2 * mass / softest  # of the softest base's usual displacement
+    turn = np.empty(9)
+    mujoco.mju_quat2Mat(turn, machine.model.body_quat[root])
+    axes = tuple(tuple(row) for row in turn.reshape(3, 3)[:2].tolist())  # the world's x and y in the body's frame
+    stiff = Elastic(mass / machine.timestep**2, mass, (start, start * _SOFTEST * frequency), inertia=mass)
+    return Base(str(machine.model.body(root).name), axes, stiff)
+
+
+def _swaying(machine: Machine) -> tuple[int, float, float, float] | None:
+    """The body that a base carries, its mass, kg, the fastest joint's frequency, rad/s, the softest stiffness, N/m.
+
+    None of a machine with several such bodies, a free one, one without a name, or without joints of its own.
+    """
+    model, free = machine.model, int(mujoco.mjtJoint.mjJNT_FREE)
+    roots = [b for b in range(1, model.nbody) if model.body_parentid[b] == 0 and model.body_jntnum[b] > 0]
+    if len(roots) != 1 or int(model.jnt_type[model.body_jntadr[roots[0]]]) == free or not machine.joints:
+        return None
+    mass = float(model.body_subtreemass[roots[0]])
+    frequency = max(sizes.velocity / sizes.position for sizes in machine.joints.values())
+    softest = mass * (_SOFTEST * frequency) ** 2
+    resolved = mass / machine.timestep**2 >= _LEAST_RANGE * softest
+    return (roots[0], mass, frequency, softest) if model.body(roots[0]).name and resolved else None

@@ -10,7 +10,7 @@ from sipe_bayes.core.arrays import FloatArray
 from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.envs.internal.elastic import Gear, Link
 from sipe_bayes.structure.extension import PROBE, Extension
-from sipe_bayes.structure.extensions import elastic, sites
+from sipe_bayes.structure.extensions import sites
 from sipe_bayes.structure.extensions.row import Probes, Row, Unknown
 from sipe_bayes.structure.machine import Machine
 
@@ -138,47 +138,47 @@ _ROWS: tuple[Extension, ...] = (
         [Unknown("medium_density", 0.0, 1200.0, "of the medium; air has 1.2, brine 1200", "option.density"),
          Unknown("medium_viscosity", 0.0, 1.5, "of the medium; air has 2e-5, glycerine 1.5", "option.viscosity")]),
     # the position is measured behind the gear, at the joint
-    Row("gear_compliance", "joint", "gear compliance at {}", _SPONG, partial(elastic.compliance, "gear"),
-        tried=_COMPLIANCES, edited=partial(elastic.spring, Gear)),
+    Row("gear_compliance", "joint", "gear compliance at {}", _SPONG, partial(sites.compliance, "gear"),
+        tried=_COMPLIANCES, edit=partial(sites.spring, Gear)),
     # the position is measured before the link, at the motor
-    Row("link_compliance", "joint", "link or shaft compliance behind {}", _SPONG, partial(elastic.compliance, "link"),
-        tried=_COMPLIANCES, edited=partial(elastic.spring, Link)),
-    Row("gear_backlash", "joint", "backlash between the motor and {}", _NORDIN, partial(elastic.backlash, "gear"),
-        tried=_GAPS, edited=partial(elastic.spring, Gear)),
-    Row("link_backlash", "joint", "backlash behind {}", _NORDIN, partial(elastic.backlash, "link"),
-        tried=_GAPS, edited=partial(elastic.spring, Link)),
+    Row("link_compliance", "joint", "link or shaft compliance behind {}", _SPONG, partial(sites.compliance, "link"),
+        tried=_COMPLIANCES, edit=partial(sites.spring, Link)),
+    Row("gear_backlash", "joint", "backlash between the motor and {}", _NORDIN, partial(sites.backlash, "gear"),
+        tried=_GAPS, edit=partial(sites.spring, Gear)),
+    Row("link_backlash", "joint", "backlash behind {}", _NORDIN, partial(sites.backlash, "link"),
+        tried=_GAPS, edit=partial(sites.spring, Link)),
     Row("lag", "actuator", "a first-order lag of {}", 'MuJoCo documentation, actuator dyntype="filterexact"',
         [Unknown("lag", 0.0, lambda s: min(0.2, 50 * s.dt), "time constant from command to force")],
-        tried=sites.one_sample, alike=True, imitator="delay", edited=sites.filtered_command),
+        tried=sites.one_sample, alike=True, imitator="delay", edit=sites.filtered_command),
     Row("cogging", "actuator", "cogging at the joint of {}", "MuJoCo documentation, actuator/dcmotor, cogging",
         sites.cogging, "actuator/dcmotor, cogging", native=False, tried=sites.numbers_of_poles),
     Row("gain", "actuator", "a gain error of {}", "-", sites.gain,
-        whole=lambda machine, site: (float(machine.model.actuator(site).gainprm[0]),),
+        wholes=lambda machine, site: (float(machine.model.actuator(site).gainprm[0]),),
         error="a {share:.3g} % error of the gain of {site}"),
     Row("log_gain", "actuator", "a gain of {} that differs between the logs", "-", sites.log_gain, per_log=True),
     Row("mass", "body", "a mass error of {}", _INERTIAL, sites.mass,
-        whole=lambda machine, site: (machine.bodies[site].mass,), error="a {share:.3g} % error of the mass of {site}"),
+        wholes=lambda machine, site: (machine.bodies[site].mass,), error="a {share:.3g} % error of the mass of {site}"),
     Row("log_mass", "body", "a mass of {} that differs between the logs", _INERTIAL, sites.log_mass, per_log=True),
     # as where CAD has left out motors and cables
     Row("centre_of_mass", "body", "a centre of mass offset of {}", _INERTIAL, sites.centre_of_mass,
-        whole=lambda machine, site: (machine.bodies[site].reach,) * sum(machine.bodies[site].turned),
+        wholes=lambda machine, site: (machine.bodies[site].reach,) * sum(machine.bodies[site].turned),
         error="an error of the centre of mass of {site} by {share:.3g} % of its reach"),
     sites.SensorDelay(),
     Row("sensor_filter", "channel", "a low-pass filter of {}", "-",
         [Unknown("filter", 0.0, lambda s: min(0.05, 20 * s.dt), "time constant of a low-pass filter")],
-        native=False, imitator="delay", longest=lambda dt: 3 * min(0.05, 20 * dt)),
+        native=False, imitator="delay", memory=lambda dt: 3 * min(0.05, 20 * dt)),
     Row("gravity_tilt", "world", "a base that is tilted", "-", sites.gravity_tilt),
-    Row("base_compliance", "world", "a base that moves under the machine", "-", elastic.base,
-        tried=_BASES, edited=elastic.base_joints),
+    Row("base_compliance", "world", "a base that moves under the machine", "-", sites.base,
+        tried=_BASES, edit=sites.base_joints),
     Row("supply_sag", "world", "a supply whose voltage falls with the force of all motors", "-", sites.supply_sag,
         _MEAN_GAIN, native=False),
     Row("physics_step", "world", "physics steps an eighth as long", "L. F. Richardson 1911", [],
-        tried=_ALONE, fixed=True, slow=8, error="the effect of the physics step", edited=sites.shorter_steps),
+        tried=_ALONE, fixed=True, slow=8, error="the effect of the physics step", edit=sites.shorter_steps),
     Row("hard_friction", "world", "dry friction that does not creep (solreffriction, solimpfriction)",
         "MuJoCo documentation, joint solreffriction and solimpfriction", [],
-        tried=_ALONE, fixed=True, edited=sites.hard_friction),
+        tried=_ALONE, fixed=True, edit=sites.hard_friction),
     Row("residual", "joint", "an unstructured residual force at {}",
         "A. Rahimi, B. Recht 2007, Random Features for Large-Scale Kernel Machines",
-        sites.residual, native=False, by_name=True, edited=sites.residual_lengths),
+        sites.residual, native=False, by_name=True, edit=sites.residual_lengths),
 )  # fmt: skip
 ROWS = {row.name: row for row in _ROWS}
