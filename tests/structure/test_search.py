@@ -63,9 +63,12 @@ def test_what_is_not_at_its_optimum_is_fitted_again(monkeypatch: pytest.MonkeyPa
     """A structure behind its part from the part's optimum; a plain model that one outdoes by more than predicted."""
     search = searched(log(pendulum(FRICTION), [0.6, 0.08, 0.1], 5)).search
     begun, fit = list[tuple[Any, Any]](), Laplace.fit
-    monkeypatch.setattr(
-        Laplace, "fit", lambda m, *a: (begun.append((m.options.initial[0], m.initial_starts)), fit(m, *a))[1]
-    )
+
+    def fitted(method: Laplace, *given: Any) -> Posterior:
+        begun.append((method.options.initial[0], method.initial_starts))  # type: ignore[index]
+        return fit(method, *given)
+
+    monkeypatch.setattr(Laplace, "fit", fitted)
     fitting, (friction,) = search.fitting, search.structure(["dry_friction:hinge"])
     plain = fitting.fit([], np.array([0.5, 0.5]), 2000)
     initial, begun[:] = np.array([0.5, 0.5, 0.2]), []
