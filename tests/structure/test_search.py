@@ -16,6 +16,7 @@ from sipe_bayes.core.parameters import Parameter
 from sipe_bayes.core.trajectory import Trajectories, Trajectory
 from sipe_bayes.inference.laplace import Laplace
 from sipe_bayes.likelihood import Noise, Segments
+from sipe_bayes.posterior import Posterior
 from sipe_bayes.structure import DiscoverOptions, Extension, Restriction, Structures, discover
 from sipe_bayes.structure.fitted import FittedStructure
 from sipe_bayes.structure.machine import Machine
