@@ -74,7 +74,7 @@ def discover(
         SearchInterrupted: with what the search has, where it is interrupted.
     """
     problem = problem if isinstance(problem, Problem) else prepare(problem)
-    return search(
+    structures = search(
         problem.simulator,
         problem.train,
         holdout=problem.holdout,
@@ -88,6 +88,7 @@ def discover(
         checkpoint=checkpoint,
         progress=progress,
     )
+    return without_worse(problem, structures)
 
 
 def _restriction(problem: Problem, only: Sequence[str] | None, without: Sequence[str]) -> Restriction:
@@ -164,7 +165,8 @@ def run_discovery(
                 progress(f"comparing before and after: {what}", structures.rollouts, structures.rollouts)
 
         try:
-            structures = without_worse(problem, structures, tell)
+            if structures.search.ended == "interrupted":
+                structures = without_worse(problem, structures, tell)
             discovery = summarise(problem, structures, name, chosen, began, tell)
             findings = (*unexplained, *discovery.findings)
             discovery = replace(discovery, findings=findings, run=record, out=str(folder))

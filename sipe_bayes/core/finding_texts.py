@@ -127,7 +127,7 @@ class Code(Enum):
     SEARCHED_ON_PARTS = note(
         "the search used {used:.3g} of the logs' {all:.3g} s; `sipe calibrate` of its result uses all"
     )
-    STRUCTURES_CUT_SHORT = blocking(
+    STRUCTURES_CUT_SHORT = caution(
         "the search ended {why} before {before}{untried}: {remedy}, and the same folder goes on"
     )
 

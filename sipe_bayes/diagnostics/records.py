@@ -70,7 +70,7 @@ class Comparison:
 
     @property
     def falls_behind(self) -> bool:
-        """Whether the errors are larger by more than one standard error."""
+        """Whether the errors are larger by more than about one standard error: p is below that of one of a normal."""
         return self.ratio < 1 and self.p < 2 * float(scipy.stats.norm.sf(1))
 
 

@@ -1,4 +1,4 @@
-"""What a model may lack: extensions (a file for each kind of site), their predicted gains, comparison, and the search.
+"""What a model may lack: extensions (rows of one table), their predicted gains, comparison, and the search.
 
 ``discover`` fits the user's model, ranks all extensions by a score test, fits the best few beside the best structures,
 and compares them by what they predict of held-out pieces. It returns ``Structures``: the set that the logs support, and

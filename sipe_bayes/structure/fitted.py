@@ -208,10 +208,13 @@ class Fitting:
         out, whole = dict[str, float](), square(lin.residual, np.arange(n))
         for piece in placed:
             own, theta = columns[piece.label], one.theta.copy()
+            if not len(own):
+                out[piece.label] = 0.0
+                continue
             theta[own] = piece.plain
             (residual,), (valid,) = windows.residuals(theta[None], one.starts[None])
             left = square(residual, np.setdiff1d(np.arange(n), own)) if valid else math.inf
-            out[piece.label] = 0.5 * (left - whole) if len(own) else 0.0
+            out[piece.label] = 0.5 * (left - whole)
         return out, windows.rollouts
 
     def _scoring(self, windows: BoundLikelihood) -> int:

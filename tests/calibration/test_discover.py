@@ -326,4 +326,4 @@ def test_a_structure_with_larger_errors_on_held_out_logs_is_not_written(
     assert (found.kept == ()) == refused
     assert [row.labels for row in found.rows if row.refused] == ([("dry_friction:hinge",)] if refused else [])
     text = " ".join(one.text for one in discovery_verdicts(found))
-    assert ("held-out logs are predicted worse with it, so it is left out" in text) == refused
+    assert ("Refused, since errors on held-out logs are larger" in text) == refused

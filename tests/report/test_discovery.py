@@ -103,6 +103,18 @@ VERDICTS: dict[str, tuple[Discovery, str, str]] = {  # of what, the tone, words 
         "bad",
         "--budget 60000, and the same folder",
     ),
+    "refused": (
+        dataclasses.replace(
+            make_discovery(FRICTION), rows=(row("dry", weight=1.0), dataclasses.replace(row("drag"), refused=True))
+        ),
+        "fair",
+        "Refused, since errors on held-out logs are larger than those of the plain model: drag.",
+    ),
+    "cut short, a tie": (
+        dataclasses.replace(make_discovery(FRICTION, tied=(TWIN,)), settled=False, findings=(CUT,)),
+        "bad",
+        "No value may be trusted yet",
+    ),
     "cut short, noise": (changed(FRICTION, settled=False, findings=(CUT,)), "fair", "printed intervals, though the"),
     "nothing, cut short": (changed(settled=False, findings=(CUT,)), "fair", "was not tried to the end"),
     "cut short, wider": (

@@ -140,7 +140,7 @@ def untold(found: Discrepancy) -> list[Finding]:
     for one in moving:
         if not one.probe.is_step:  # the interval allows for steps
             hangs |= one.moves(sd)
-    if len(said) > 1:
+    if len(said) > 1 and not moving[0].probe.is_step:
         said[0] += " Measure that first: nothing else moves a value as far."
     names = [space[j].name for j in np.flatnonzero(hangs).tolist()]
     return [finding(Code.UNTOLD, parameters=names, moved=" ".join(said))] if said else []

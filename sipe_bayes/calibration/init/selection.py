@@ -186,6 +186,10 @@ def _limited(model: mujoco.MjModel, one: Proposal, share: float, rough: Sizes) -
     fields = [target.rpartition(".") for target in one.targets]
     if one.relative or fields[0][2] not in RESISTANCE:
         return one
+    if any(
+        owner.removeprefix("joint:") not in rough.force for owner, _, _ in fields
+    ):  # a tendon without a lever in the model's own pose
+        return one
     alone = [propose_of_joint(model, owner, [RESISTANCE[field]], rough)[0].high for owner, _, field in fields]
     return replace(one, high=min(one.high, max([*alone, rounded_up(share * one.high)])))
 

@@ -108,12 +108,16 @@ def ties(discovery: Discovery) -> Verdict | None:
         would = "Logs cut to where they differ, or other motions," if parts else "More logs, or other motions,"
         texts.append(f"Within two standard errors these structures predict the logs as well: {named}.")
         texts.append(f"The simplest of them, {structure_text(best)}, is written to discovered.xml. {would} may tell.")
+    refused = [structure_text(row) for row in discovery.rows if row.refused]
+    if refused:
+        named = "; ".join(refused)
+        texts.append(f"Refused, since errors on held-out logs are larger than those of the plain model: {named}.")
     larger = max(discovery.rows, key=lambda row: row.gain)
-    if not larger.tied and larger.gain > best.gain and set(best.labels) < set(larger.labels):
+    if not larger.tied and not larger.refused and larger.gain > best.gain and set(best.labels) < set(larger.labels):
         pairs = zip(larger.sentences, larger.labels, strict=True)
         added = listed([sentence for sentence, label in pairs if label not in best.labels])
         gain = with_error(-larger.behind, larger.behind_error)
-        worse = larger.refused or -larger.behind > 2 * larger.behind_error
+        worse = -larger.behind > 2 * larger.behind_error
         why = "held-out logs are predicted worse with it" if worse else "less than two standard errors"
         texts.append(f"Adding {added} gains {gain} nats: {why}, so it is left out.")
     return Verdict("fair", " ".join(texts)) if texts else None
@@ -135,7 +139,7 @@ def remains(discovery: Discovery) -> Verdict | None:
 def trust(discovery: Discovery) -> Verdict:
     """Which intervals hold: those stacked over the structures, once residuals pass and the search has settled."""
     cut, widened = cut_short(discovery), any(p.further is not None for p in discovery.parameters)
-    if cut is not None and discovery.passes and discovery.best_settled:
+    if cut is not None and discovery.passes and discovery.best_settled and not alternatives(discovery):
         return Verdict("fair", f"Values may be trusted within the printed intervals, though {cut}.")
     if cut is not None and discovery.kept and discovery.best_settled and widened:
         return Verdict("fair", f"Use values within the intervals with what the model lacks, no narrower: {cut}.")
@@ -216,5 +220,5 @@ def warnings(discovery: Discovery) -> list[str]:
 
 
 def cut_short(discovery: Discovery) -> str | None:
-    """What the budget was spent before; None where it was enough."""
+    """What a search that was cut short did not come to; None where it ended by itself."""
     return next((item.text for item in Findings(discovery.findings).of(Code.STRUCTURES_CUT_SHORT)), None)

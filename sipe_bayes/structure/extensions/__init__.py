@@ -1,1 +1,1 @@
-"""Extensions: one file for each kind of place."""
+"""Extensions: rows of one table, and what rows need."""

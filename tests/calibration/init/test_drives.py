@@ -88,3 +88,24 @@ def test_the_damping_beside_a_velocity_servo_is_free(tmp_path: Path) -> None:
     model = PENDULUM.replace('<motor name="fan" joint="hinge"', '<velocity name="fan" joint="hinge" kv=".4"')
     draft = driven(tmp_path, model, "", 1.0, "hinge_cmd_vel")
     assert {"fan_kv", "hinge_damping"} <= {unknown.name for unknown in draft.free}
+
+
+def test_a_tendon_without_a_lever_in_the_models_own_pose_is_proposed(tmp_path: Path) -> None:
+    """A cable that runs straight through the joint's axis there, and pulls beside it along the log."""
+    model = """<mujoco><option timestep="0.002"/><worldbody><site name="a" pos="0 0 1"/><body><joint name="elbow"
+      axis="0 1 0" damping=".02"/><geom size=".05" pos="0 0 -.5" mass="1"/><site name="c" pos="0 0 -.5"/></body>
+      </worldbody>
+      <tendon><spatial name="cable" damping=".3"><site site="a"/><site site="c"/></spatial></tendon>
+      <actuator><motor name="m" tendon="cable"/></actuator></mujoco>"""
+    (tmp_path / "model.xml").write_text(model.replace('damping=".3"', 'damping=".1"'))
+    compiled = mujoco.MjModel.from_xml_string(model)
+    data, rows = mujoco.MjData(compiled), []
+    data.qpos[0] = 0.8
+    for k in range(600):
+        data.ctrl[0] = 3 * np.sin(0.02 * k) + 2 * np.sin(0.055 * k)
+        rows.append([0.01 * k, data.ctrl[0], data.qpos[0] + 1e-4 * np.cos(7 * k), data.qvel[0]])
+        mujoco.mj_step(compiled, data, 5)
+    names = ["time", "m_force_N", "elbow_pos_rad", "elbow_vel_rad_s"]
+    pd.DataFrame(rows, columns=names).to_csv(tmp_path / "log.csv", index=False)
+    draft = propose(tmp_path / "model.xml", [tmp_path / "log.csv"], tmp_path)
+    assert any("tendon:cable.damping" in one.targets for one in draft.free)
