@@ -175,6 +175,8 @@ def envs(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")] = False,
 ) -> None:
     """The benchmark's environments; with NAME its parameters and what each writes."""
+    import mujoco  # noqa: F401 - where it cannot be imported there is a line of its own
+
     from sipe_bayes.core.files import to_json
     from sipe_bayes.envs.registry import TASKS, make_task
 
