@@ -2,7 +2,7 @@
 
     python examples/studies/discover.py                                   # all cells, twenty logs each; days
     python examples/studies/discover.py --sizes middle --noises white --seeds 3
-    python examples/studies/discover.py --machines so101 --sizes middle --noises white --seeds 1    # an hour
+    python examples/studies/discover.py --machines so101 --sizes middle --noises white --seeds 1    # not run yet
     python examples/studies/discover.py --seeds 0                         # tables and picture of what there is
 
 Machines: a pendulum with a motor, a double pendulum with a motor at each joint, and a horizontal slide with a drive;
